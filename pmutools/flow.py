@@ -1,0 +1,46 @@
+"""What a source of bytes hands on: chunks of one flow, each with the time it arrived."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class StampSource(StrEnum):
+    """Who took an arrival time, best first."""
+
+    HARDWARE = "hardware"
+    KERNEL = "kernel"
+    KERNEL_BATCHED = "kernel-batched"
+    """One kernel stamp for several frames of a TCP read: an upper bound for all but the last."""
+    USER = "user"
+    CAPTURE = "capture"
+
+
+class Flow(NamedTuple):
+    """One direction of one conversation. ``transport`` is ``udp``, ``tcp`` or ``file``.
+
+    ``source`` and ``destination`` are ``host:port`` (``[host]:port`` for IPv6), or a file's name. ``connection``
+    counts the TCP connections seen between the same two endpoints, from 0.
+    """
+
+    transport: str
+    source: str
+    destination: str = ""
+    connection: int = 0
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether a frame may continue in the flow's next chunk (a datagram holds whole frames)."""
+        return self.transport != "udp"
+
+
+class Chunk(NamedTuple):
+    """Bytes of one flow, in order: a datagram, a TCP segment's new bytes, or a piece of a file."""
+
+    data: bytes
+    arrival_ns: int | None
+    flow: Flow
+    stamp_source: StampSource = StampSource.CAPTURE
+    lost_before: int = 0
+    """Bytes of the flow known to be missing just before ``data`` (a hole in a capture)."""
