@@ -1,0 +1,304 @@
+"""Many frames of one stream and configuration at once: a zero-copy wire view, and its columns in SI units.
+
+N equal frames are one read-only big-endian structured array (:func:`wire_view`); :func:`decode_batch` turns it into
+native columns, :func:`encode_batch` turns columns into frames. Both go by :mod:`pmutools.c37118.layout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools import timebase
+from pmutools.c37118.checksum import chk_array
+from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import INT16_FILLER, STAT_DATA_ERROR_MASK, FrameType
+from pmutools.c37118.frames import RAD_PER_COUNT, Data
+from pmutools.c37118.layout import dtype_of, layout_of
+from pmutools.errors import ChecksumError, ConfigError, LengthError
+from pmutools.flow import StampSource
+
+NO_TIME = np.iinfo(np.int64).min
+"""``arrival_ns`` of a frame whose arrival nobody saw."""
+STAMP_SOURCES = tuple(StampSource)
+_BLOCK_BYTES = 1 << 18
+"""Frames are converted in pieces of about this size, which stay in the processor's cache."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """N frames of one stream, as columns. S stations, P phasors, A analogs, D digital words over all stations.
+
+    Absent numbers are NaN; ``valid`` says whether STAT calls the station's data good and any of it is present.
+    """
+
+    config: StreamConfig
+    time_ns: npt.NDArray[np.int64]
+    """(N,) time of measurement, POSIX UTC."""
+    arrival_ns: npt.NDArray[np.int64]
+    """(N,) time of arrival, POSIX UTC; :data:`NO_TIME` where unknown."""
+    stamp_source: npt.NDArray[np.uint8]
+    """(N,) index into :data:`STAMP_SOURCES`."""
+    time_quality: npt.NDArray[np.uint8]
+    """(N,) the whole time quality byte: leap flags and MSG_TQ."""
+    stat: npt.NDArray[np.uint16]
+    """(N, S) STAT."""
+    phasors: npt.NDArray[np.complex128]
+    """(N, P) V or A RMS."""
+    frequency: npt.NDArray[np.float64]
+    """(N, S) absolute, Hz."""
+    rocof: npt.NDArray[np.float64]
+    """(N, S) Hz/s."""
+    analogs: npt.NDArray[np.float64]
+    """(N, A) wire values with CFG-1/2, scaled by ANSCALE with CFG-3."""
+    digitals: npt.NDArray[np.uint16]
+    """(N, D)."""
+    valid: npt.NDArray[np.bool_]
+    """(N, S)."""
+    wire: npt.NDArray[np.void] | None = None
+    """(N,) the frames these columns came from, if they came from frames; read-only."""
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def __getitem__(self, rows: slice) -> Batch:
+        """The frames of a slice, as views."""
+        kept = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Batch(**{name: v if name == "config" or v is None else v[rows] for name, v in kept.items()})
+
+    def data(self) -> Iterator[Data]:
+        """Each frame as :class:`Data`, from its wire bytes, encoded first where there are none."""
+        wire = self.wire if self.wire is not None else wire_view(encode_batch(self)[0].tobytes(), self.config)
+        raw, size, layout = wire.tobytes(), self.config.frame_size, layout_of(self.config)
+        for at in range(0, len(raw), size):
+            yield Data(self.config, layout.unpacker.unpack_from(raw, at))
+
+
+def wire_view(frames: bytes, config: StreamConfig) -> npt.NDArray[np.void]:
+    """Data frames laid end to end, as a read-only structured array (N,) that shares their memory.
+
+    Raises LengthError where ``frames`` is no whole number of frames of this configuration.
+    """
+    size = config.frame_size
+    if len(frames) % size:
+        raise LengthError(f"data frames of {config.idcode}", size, len(frames) % size, idcode=config.idcode)
+    view = np.frombuffer(frames, dtype_of(config))
+    view.flags.writeable = False
+    return view
+
+
+def decode_batch(
+    frames: bytes | npt.NDArray[np.void],
+    config: StreamConfig,
+    arrival_ns: npt.ArrayLike | None = None,
+    stamp_source: npt.ArrayLike = 0,
+    *,
+    check: bool = True,
+) -> Batch:
+    """Columns of N data frames laid end to end (or of their :func:`wire_view`).
+
+    ``arrival_ns`` is (N,) or None, ``stamp_source`` (N,) or one index into :data:`STAMP_SOURCES`. ``check=False``
+    skips CHK and the prefix, for frames that a framer has passed.
+
+    Raises
+    ------
+    LengthError, ChecksumError, ConfigError
+        Not a whole number of frames; a CHK is wrong; a frame is not a data frame of this stream.
+    """
+    wire = frames if isinstance(frames, np.ndarray) else wire_view(frames, config)
+    count, layout = len(wire), layout_of(config)
+    if check:
+        _check(wire, config)
+    batch = Batch(
+        config,
+        timebase.to_ns_array(wire["soc"], wire["fracsec"] & np.uint32(0xFFFFFF), config.time_base),
+        np.full(count, NO_TIME) if arrival_ns is None else np.asarray(arrival_ns, np.int64),
+        np.broadcast_to(np.asarray(stamp_source, np.uint8), (count,)),
+        (wire["fracsec"] >> 24).astype(np.uint8),
+        np.empty((count, len(layout.slots)), np.uint16),
+        np.empty((count, len(layout.phasors)), np.complex128),
+        np.empty((count, len(layout.slots))),
+        np.empty((count, len(layout.slots))),
+        np.empty((count, len(layout.analogs))),
+        np.empty((count, sum(len(slots.digitals) for slots in layout.slots)), np.uint16),
+        np.empty((count, len(layout.slots)), np.bool_),
+        wire,
+    )
+    step = max(1, _BLOCK_BYTES // config.frame_size)
+    for first in range(0, count, step):
+        _fill(batch, slice(first, first + step))
+    return batch
+
+
+def _check(wire: npt.NDArray[np.void], config: StreamConfig) -> None:
+    size = config.frame_size
+    octets = np.ascontiguousarray(wire).view(np.uint8).reshape(-1, size)
+    if (chks := chk_array(octets)).any():
+        worst = int(np.flatnonzero(chks)[0])
+        frame = octets[worst]
+        expected = int(chk_array(frame[None, :-2])[0])
+        raise ChecksumError(expected, int(wire["chk"][worst]), idcode=config.idcode)
+    right = (
+        (wire["sync"] & 0xFFF0 == FrameType.DATA.sync & 0xFFF0)
+        & (wire["framesize"] == size)
+        & (wire["idcode"] == config.idcode)
+    )
+    if not right.all():
+        raise ConfigError(f"frame {int(np.argmin(right))} is no data frame of stream {config.idcode}")
+
+
+def _fill(batch: Batch, rows: slice) -> None:
+    """Convert one block of rows, station by station."""
+    assert batch.wire is not None
+    wire, layout = batch.wire[rows], layout_of(batch.config)
+    parts = batch.phasors[rows].view(np.float64).reshape(len(wire), -1, 2)
+    frequency, rocof, stat = batch.frequency[rows], batch.rocof[rows], batch.stat[rows]
+    for number, (fields_, slots) in enumerate(zip(layout.stations, layout.slots, strict=True)):
+        block, names = wire[f"s{number}"], {field.name for field in fields_}
+        stat[:, number] = block["stat"]
+        if "phasors" in names:
+            columns = slice(slots.phasor_columns.start, slots.phasor_columns.stop)
+            _phasors(parts[:, columns], block["phasors"], batch, columns)
+        frequency[:, number], rocof[:, number] = block["freq"], block["dfreq"]
+        if not slots.freq_float:
+            _scale_frequency(frequency[:, number], slots.fnom_hz, 1000)
+            _scale_frequency(rocof[:, number], 0.0, 100)
+        if "analogs" in names:
+            analogs = slice(slots.analog_columns.start, slots.analog_columns.stop)
+            out = batch.analogs[rows, analogs]
+            out[...] = block["analogs"]
+            scales = [layout.analogs[column] for column in slots.analog_columns]
+            if any(scale.multiplier != 1 or scale.offset != 0 for scale in scales):
+                out *= [scale.multiplier for scale in scales]
+                out += [scale.offset for scale in scales]
+        if "digitals" in names:
+            words = slots.digital_columns
+            batch.digitals[rows, words.start : words.stop] = block["digitals"]
+    good = (stat & STAT_DATA_ERROR_MASK) == 0
+    for row, number in np.argwhere(good & np.isnan(frequency)):
+        columns = layout.slots[number].phasor_columns
+        good[row, number] = not np.isnan(batch.phasors[rows][row, columns.start : columns.stop]).all()
+    batch.valid[rows] = good
+
+
+def _scale_frequency(column: npt.NDArray[np.float64], base: float, counts: int) -> None:
+    absent = column == INT16_FILLER
+    column /= counts
+    if base:
+        column += base
+    if absent.any():
+        column[absent] = np.nan
+
+
+def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], batch: Batch, columns: slice) -> None:
+    """Wire phasors of one station into ``out`` (N, P, 2), as real and imaginary parts in SI units."""
+    slots = layout_of(batch.config).phasors[columns]
+    factor = np.array([slot.factor for slot in slots])
+    turn = np.array([slot.angle_offset_rad for slot in slots])
+    floating = slots[0].floating
+    if slots[0].polar:
+        if floating:
+            magnitude, angle, absent = raw[..., 0].astype(float), raw[..., 1].astype(float), None
+        else:
+            magnitude, counts = raw["mag"].astype(float), raw["angle"]
+            angle, absent = counts * RAD_PER_COUNT, counts == INT16_FILLER
+        magnitude *= factor
+        angle -= turn
+        with np.errstate(invalid="ignore"):  # an infinite angle or 0 * inf: NaN is the answer
+            np.multiply(magnitude, np.cos(angle), out=out[..., 0])
+            np.multiply(magnitude, np.sin(angle), out=out[..., 1])
+    else:
+        out[...] = raw
+        absent = None if floating else (out == INT16_FILLER).all(-1)
+        if (factor != 1).any():
+            out *= factor[:, None]
+        if turn.any():
+            turned = out[..., 0] + 1j * out[..., 1]
+            turned *= np.exp(-1j * turn)
+            out[..., 0], out[..., 1] = turned.real, turned.imag
+    if absent is not None and absent.any():
+        out[absent] = np.nan
+
+
+def encode_batch(batch: Batch) -> tuple[npt.NDArray[np.uint8], int]:
+    """Frames of ``batch``'s columns, (N, FRAMESIZE) bytes, and how many values were clipped to their field's range.
+
+    Integer fields take the nearest count; NaN becomes the filler of its FORMAT. ``batch.wire`` is not looked at.
+    """
+    config, layout, count = batch.config, layout_of(batch.config), len(batch)
+    wire = np.zeros(count, dtype_of(config))
+    soc, fracsec = timebase.from_ns_array(batch.time_ns, config.time_base)
+    wire["sync"], wire["framesize"], wire["idcode"] = FrameType.DATA.sync, config.frame_size, config.idcode
+    wire["soc"], wire["fracsec"] = soc, fracsec | batch.time_quality.astype(np.int64) << 24
+    clipped = 0
+    for number, (fields_, slots) in enumerate(zip(layout.stations, layout.slots, strict=True)):
+        block, names = wire[f"s{number}"], {field.name for field in fields_}
+        block["stat"] = batch.stat[:, number]
+        if "phasors" in names:
+            columns = slice(slots.phasor_columns.start, slots.phasor_columns.stop)
+            clipped += _put_phasors(block, batch, columns)
+        if slots.freq_float:
+            block["freq"], block["dfreq"] = batch.frequency[:, number], batch.rocof[:, number]
+        else:
+            block["freq"], over = _int16((batch.frequency[:, number] - slots.fnom_hz) * 1000)
+            block["dfreq"], over_rocof = _int16(batch.rocof[:, number] * 100)
+            clipped += over + over_rocof
+        if "analogs" in names:
+            scales = [layout.analogs[column] for column in slots.analog_columns]
+            values = batch.analogs[:, slots.analog_columns.start : slots.analog_columns.stop]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                counts = (values - [scale.offset for scale in scales]) / [scale.multiplier for scale in scales]
+            if block["analogs"].dtype.kind == "i":
+                block["analogs"], over = _int16(counts)
+                clipped += over
+            else:
+                block["analogs"] = counts
+        if "digitals" in names:
+            words = slots.digital_columns
+            block["digitals"] = batch.digitals[:, words.start : words.stop]
+    octets = wire.view(np.uint8).reshape(count, config.frame_size)
+    wire["chk"] = chk_array(octets[:, :-2])
+    return octets, clipped
+
+
+def _put_phasors(block: npt.NDArray[np.void], batch: Batch, columns: slice) -> int:
+    slots = layout_of(batch.config).phasors[columns]
+    factor = np.array([slot.factor for slot in slots])
+    turn = np.array([slot.angle_offset_rad for slot in slots])
+    phasors = batch.phasors[:, columns]
+    counts = phasors / np.where(factor == 0, np.inf, factor)  # PHUNIT 0: the count says nothing, send 0
+    if turn.any():
+        counts = counts * np.exp(1j * turn)
+    absent = np.isnan(phasors)
+    out = block["phasors"]
+    if slots[0].polar:
+        magnitude, angle = np.abs(counts), np.angle(counts)
+        if slots[0].floating:
+            out[..., 0], out[..., 1] = magnitude, angle
+            return 0
+        magnitude, over = _whole(magnitude, 0, 0xFFFF)
+        out["mag"] = magnitude
+        out["angle"] = np.where(absent, INT16_FILLER, np.rint(np.nan_to_num(angle) / RAD_PER_COUNT))
+        return over
+    parts = cast("npt.NDArray[np.float64]", np.stack((counts.real, counts.imag), axis=-1))
+    if slots[0].floating:
+        out[...] = parts
+        return 0
+    out[...], over = _int16(parts)
+    return over
+
+
+def _int16(values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], int]:
+    """Nearest int16 counts with NaN as the filler, and how many were out of range (-32768 itself is the filler)."""
+    return _whole(values, INT16_FILLER, -INT16_FILLER - 1)
+
+
+def _whole(values: npt.NDArray[np.float64], low: int, high: int) -> tuple[npt.NDArray[np.float64], int]:
+    absent = np.isnan(values)
+    counts = np.rint(np.where(absent, low, values))
+    clipped = np.clip(counts, low, high)
+    return clipped, int(np.count_nonzero(clipped != counts))

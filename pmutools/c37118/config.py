@@ -1,0 +1,500 @@
+"""Configurations: what a stream carries, decoded from and encoded to CFG-1, CFG-2 and CFG-3 frames.
+
+A :class:`StreamConfig` is the same object whichever frame it came from. What a frame holds beyond the meaning of
+its fields (reserved bits, padding other than spaces) is kept beside it, so that encoding gives the bytes back.
+
+Layouts: CFG-1 and CFG-2 clause 6.4 and Table 8, CFG-3 clause 6.5 and Table 10.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+from pmutools.c37118.checksum import chk
+from pmutools.c37118.constants import (
+    CHK_SIZE,
+    FNOM_50_HZ,
+    LABELS_PER_WORD,
+    MAX_FRAME_SIZE,
+    NAME_SIZE,
+    PHSCALE_CURRENT,
+    PREFIX_SIZE,
+    TIME_BASE_MASK,
+    Format,
+    FrameType,
+)
+from pmutools.c37118.prefix import Prefix, encode_prefix, verified
+from pmutools.errors import ConfigError, EncodeError
+
+PhasorKind = Literal["V", "I"]
+
+
+class PhasorScale(NamedTuple):
+    """PHSCALE of CFG-3: value = scale * X * exp(-1j * angle_offset_rad), in primary V or A."""
+
+    flags: int
+    type: int
+    user: int
+    scale: float
+    angle_offset_rad: float
+
+
+class AnalogScale(NamedTuple):
+    """ANSCALE of CFG-3: value = multiplier * X + offset."""
+
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True, slots=True)
+class PhasorChannel:
+    """One phasor. ``phunit`` is the raw PHUNIT word of CFG-1/2 (1e-5 V or A a count), ``phscale`` that of CFG-3."""
+
+    name: str
+    phunit: int = 0
+    phscale: PhasorScale | None = None
+    wire_name: bytes | None = field(default=None, repr=False)
+
+    @property
+    def kind(self) -> PhasorKind:
+        if self.phscale is not None:
+            return "I" if self.phscale.type & PHSCALE_CURRENT else "V"
+        return "I" if self.phunit >> 24 & 1 else "V"
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogChannel:
+    """One analog. ``anunit`` is the raw ANUNIT word of CFG-1/2, whose scaling only the user knows."""
+
+    name: str
+    anunit: int = 0
+    anscale: AnalogScale | None = None
+    wire_name: bytes | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class DigitalWord:
+    """One 16-bit digital status word; ``labels[j]`` names bit j. Masks as in DIGUNIT."""
+
+    labels: tuple[str, ...]
+    normal: int = 0
+    valid: int = 0xFFFF
+    wire_names: tuple[bytes | None, ...] = field(default=(None,) * LABELS_PER_WORD, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class StationDetails:
+    """What only CFG-3 says of a PMU: global id, place (degrees, metres; infinity = unspecified), class, filter (us)."""
+
+    g_pmu_id: bytes = bytes(16)
+    latitude_deg: float = float("inf")
+    longitude_deg: float = float("inf")
+    elevation_m: float = float("inf")
+    service_class: str = "M"
+    window_us: int = 0
+    group_delay_us: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """One PMU block of a stream; ``idcode`` is the PMU's own, which may differ from the stream's."""
+
+    name: str
+    idcode: int
+    format: Format
+    phasors: tuple[PhasorChannel, ...] = ()
+    analogs: tuple[AnalogChannel, ...] = ()
+    digitals: tuple[DigitalWord, ...] = ()
+    fnom: int = 0
+    cfgcnt: int = 0
+    details: StationDetails | None = None
+    wire_name: bytes | None = field(default=None, repr=False)
+
+    @property
+    def fnom_hz(self) -> float:
+        return 50.0 if self.fnom & FNOM_50_HZ else 60.0
+
+    @property
+    def block_size(self) -> int:
+        """Bytes of this station's block in a data frame."""
+        phasor = 8 if self.format & Format.PHASOR_FLOAT else 4
+        frequency = 8 if self.format & Format.FREQ_FLOAT else 4
+        analog = 4 if self.format & Format.ANALOG_FLOAT else 2
+        return 2 + len(self.phasors) * phasor + frequency + len(self.analogs) * analog + len(self.digitals) * 2
+
+
+@dataclass(frozen=True, eq=False)
+class StreamConfig:
+    """Everything needed to decode a stream's data frames; equal configurations have equal wire bytes.
+
+    ``time_base`` is ticks per second; ``data_rate`` the raw DATA_RATE (> 0 frames/s, < 0 seconds per frame).
+    ``time_base_flags`` are the reserved upper bits of TIME_BASE, ``version`` the version nibble sent.
+    """
+
+    idcode: int
+    stations: tuple[Station, ...]
+    data_rate: int
+    time_base: int = 1_000_000
+    kind: FrameType = FrameType.CFG2
+    time_base_flags: int = 0
+    version: int = 1
+
+    @property
+    def rate(self) -> Fraction:
+        """Frames per second; 0 where the device left it undefined."""
+        return Fraction(self.data_rate) if self.data_rate >= 0 else Fraction(1, -self.data_rate)
+
+    @cached_property
+    def frame_size(self) -> int:
+        """FRAMESIZE of every data frame under this configuration."""
+        return PREFIX_SIZE + sum(station.block_size for station in self.stations) + CHK_SIZE
+
+    @cached_property
+    def body(self) -> bytes:
+        """Payload of the configuration frame, between prefix and CHK."""
+        return _encode_body(self)
+
+    @cached_property
+    def _key(self) -> tuple[int, int, bytes]:
+        return self.kind, self.idcode, self.body
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, StreamConfig) and self._key == other._key)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def decode_config(frame: bytes) -> tuple[Prefix, StreamConfig]:
+    """Decode a CFG-1, CFG-2 or CFG-3 frame.
+
+    Raises
+    ------
+    WireError
+        Not a configuration frame, wrong CHK or FRAMESIZE, counts that do not fill the frame, TIME_BASE 0, or one
+        fragment of a CFG-3 that was sent in several frames.
+    """
+    prefix = verified(frame)
+    if not prefix.type.is_config:
+        raise ConfigError(f"a {prefix.type.name} frame is no configuration", idcode=prefix.idcode)
+    return prefix, decode_config_body(prefix, frame[PREFIX_SIZE:-CHK_SIZE])
+
+
+def decode_config_body(prefix: Prefix, body: bytes) -> StreamConfig:
+    """Decode the payload of a configuration frame, or the joined payload of CFG-3 fragments (CONT_IDX first)."""
+    reader = _Reader(body, prefix.idcode)
+    if prefix.type is FrameType.CFG3:
+        (cont_idx,) = reader.unpack(_U16)
+        if cont_idx:
+            raise ConfigError(f"fragment {cont_idx} of a CFG-3", idcode=prefix.idcode)
+    time_base, num_pmu = reader.unpack(_HEAD)
+    if not time_base & TIME_BASE_MASK:
+        raise ConfigError("TIME_BASE is 0", idcode=prefix.idcode)
+    station = _read_station3 if prefix.type is FrameType.CFG3 else _read_station2
+    stations = tuple(station(reader) for _ in range(num_pmu))
+    (data_rate,) = reader.unpack(_I16)
+    if reader.at != len(body):
+        raise ConfigError(f"{len(body) - reader.at} bytes left over after DATA_RATE", idcode=prefix.idcode)
+    config = StreamConfig(
+        idcode=prefix.idcode,
+        stations=stations,
+        data_rate=data_rate,
+        time_base=time_base & TIME_BASE_MASK,
+        kind=prefix.type,
+        time_base_flags=time_base >> 24,
+        version=prefix.version,
+    )
+    if config.frame_size > MAX_FRAME_SIZE:
+        raise ConfigError(f"describes data frames of {config.frame_size} bytes", idcode=prefix.idcode)
+    return config
+
+
+def encode_config(config: StreamConfig, *, soc: int = 0, fracsec: int = 0, time_quality: int = 0) -> bytes:
+    """The configuration frame of ``config.kind``, stamped with its time of transmission.
+
+    Raises
+    ------
+    EncodeError
+        A name, count or value that the frame cannot carry, or more than 65535 bytes.
+    """
+    size = PREFIX_SIZE + len(config.body) + CHK_SIZE
+    if size > MAX_FRAME_SIZE:
+        raise EncodeError(f"configuration of {config.idcode} takes {size} bytes, FRAMESIZE ends at {MAX_FRAME_SIZE}")
+    sync = config.kind.sync & 0xFFF0 | config.version
+    frame = encode_prefix(Prefix(sync, size, config.idcode, soc, time_quality, fracsec)) + config.body
+    return frame + chk(frame).to_bytes(2, "big")
+
+
+def as_kind(config: StreamConfig, kind: FrameType) -> StreamConfig:
+    """The same stream described by another frame type.
+
+    CFG-3 gets scales that give the values CFG-2 gives, CFG-2 the nearest PHUNIT and names cut to 16 bytes. Analog
+    scaling of CFG-3 has no place in CFG-2 and is lost.
+    """
+    if (kind is FrameType.CFG3) == (config.kind is FrameType.CFG3):
+        return replace(config, kind=kind, version=kind.version)
+    convert = _station_to_3 if kind is FrameType.CFG3 else _station_to_2
+    return replace(
+        config, kind=kind, version=kind.version, stations=tuple(convert(station) for station in config.stations)
+    )
+
+
+# --- names ------------------------------------------------------------------------------------------------------
+
+_PAD = " \0"
+
+
+def _decode_name(raw: bytes) -> str:
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        text = raw.decode("latin-1")
+    return text.rstrip(_PAD)
+
+
+def _name2(name: str) -> bytes:
+    raw = name.encode("utf-8")
+    if len(raw) > NAME_SIZE:
+        raise EncodeError(f"name {name!r} takes {len(raw)} bytes, CFG-1 and CFG-2 have {NAME_SIZE}")
+    return raw.ljust(NAME_SIZE)
+
+
+def _name3(name: str) -> bytes:
+    raw = name.encode("utf-8")
+    if len(raw) > 0xFF:
+        raise EncodeError(f"name {name[:20]!r}... takes {len(raw)} bytes, CFG-3 has 255")
+    return raw
+
+
+def _encode_name2(name: str, wire_name: bytes | None) -> bytes:
+    return _name2(name) if wire_name is None else wire_name
+
+
+def _encode_name3(name: str, wire_name: bytes | None) -> bytes:
+    raw = _name3(name) if wire_name is None else wire_name
+    return bytes((len(raw),)) + raw
+
+
+def _named(raw: bytes, canonical: Callable[[str], bytes]) -> tuple[str, bytes | None]:
+    """A name, and its bytes where encoding the name would not give them back."""
+    name = _decode_name(raw)
+    try:
+        return name, None if canonical(name) == raw else raw
+    except EncodeError:  # latin-1 text that grows in UTF-8
+        return name, raw
+
+
+# --- reading ----------------------------------------------------------------------------------------------------
+
+_U16 = struct.Struct(">H")
+_I16 = struct.Struct(">h")
+_HEAD = struct.Struct(">IH")
+_BLOCK = struct.Struct(">HHHHH")
+_TAIL = struct.Struct(">HH")
+_PHSCALE = struct.Struct(">HBBff")
+_ANSCALE = struct.Struct(">ff")
+_DETAILS = struct.Struct(">fff1sii")
+
+
+class _Reader:
+    """A cursor over a configuration's payload that turns a short read into ConfigError."""
+
+    def __init__(self, body: bytes, idcode: int) -> None:
+        self.body, self.idcode, self.at = body, idcode, 0
+
+    def take(self, count: int) -> bytes:
+        if self.at + count > len(self.body):
+            offset = PREFIX_SIZE + self.at
+            raise ConfigError(f"ends inside a PMU block, at byte {offset}", idcode=self.idcode, offset=offset)
+        self.at += count
+        return self.body[self.at - count : self.at]
+
+    def unpack(self, layout: struct.Struct) -> tuple[int, ...]:
+        return layout.unpack(self.take(layout.size))
+
+    def name2(self) -> tuple[str, bytes | None]:
+        return _named(self.take(NAME_SIZE), _name2)
+
+    def name3(self) -> tuple[str, bytes | None]:
+        return _named(self.take(self.take(1)[0]), _name3)
+
+
+def _read_station2(reader: _Reader) -> Station:
+    name, wire_name = reader.name2()
+    idcode, fmt, phnmr, annmr, dgnmr = reader.unpack(_BLOCK)
+    names = [reader.name2() for _ in range(phnmr + annmr + LABELS_PER_WORD * dgnmr)]
+    phunits = reader.unpack(struct.Struct(f">{phnmr}I"))
+    anunits = reader.unpack(struct.Struct(f">{annmr}I"))
+    masks = [reader.unpack(_TAIL) for _ in range(dgnmr)]
+    fnom, cfgcnt = reader.unpack(_TAIL)
+    return Station(
+        name,
+        idcode,
+        Format(fmt),
+        tuple(PhasorChannel(n, unit, None, raw) for (n, raw), unit in zip(names, phunits, strict=False)),
+        tuple(AnalogChannel(n, unit, None, raw) for (n, raw), unit in zip(names[phnmr:], anunits, strict=False)),
+        _words(names[phnmr + annmr :], masks),
+        fnom,
+        cfgcnt,
+        None,
+        wire_name,
+    )
+
+
+def _read_station3(reader: _Reader) -> Station:
+    name, wire_name = reader.name3()
+    (idcode,) = reader.unpack(_U16)
+    g_pmu_id = reader.take(16)
+    fmt, phnmr, annmr, dgnmr = reader.unpack(struct.Struct(">HHHH"))
+    names = [reader.name3() for _ in range(phnmr + annmr + LABELS_PER_WORD * dgnmr)]
+    phscales = [PhasorScale(*reader.unpack(_PHSCALE)) for _ in range(phnmr)]
+    anscales = [AnalogScale(*reader.unpack(_ANSCALE)) for _ in range(annmr)]
+    masks = [reader.unpack(_TAIL) for _ in range(dgnmr)]
+    latitude, longitude, elevation, service, window, delay = _DETAILS.unpack(reader.take(_DETAILS.size))
+    fnom, cfgcnt = reader.unpack(_TAIL)
+    return Station(
+        name,
+        idcode,
+        Format(fmt),
+        tuple(PhasorChannel(n, 0, scale, raw) for (n, raw), scale in zip(names, phscales, strict=False)),
+        tuple(AnalogChannel(n, 0, scale, raw) for (n, raw), scale in zip(names[phnmr:], anscales, strict=False)),
+        _words(names[phnmr + annmr :], masks),
+        fnom,
+        cfgcnt,
+        StationDetails(g_pmu_id, latitude, longitude, elevation, service.decode("latin-1"), window, delay),
+        wire_name,
+    )
+
+
+def _words(names: list[tuple[str, bytes | None]], masks: list[tuple[int, ...]]) -> tuple[DigitalWord, ...]:
+    words = []
+    for index, (normal, valid) in enumerate(masks):
+        labels = names[index * LABELS_PER_WORD : (index + 1) * LABELS_PER_WORD]
+        words.append(DigitalWord(tuple(n for n, _ in labels), normal, valid, tuple(raw for _, raw in labels)))
+    return tuple(words)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------
+
+
+def _encode_body(config: StreamConfig) -> bytes:
+    third = config.kind is FrameType.CFG3
+    if not 0 < config.time_base <= TIME_BASE_MASK:
+        raise EncodeError(f"TIME_BASE {config.time_base} is outside 1..{TIME_BASE_MASK}")
+    try:
+        parts = [_U16.pack(0)] if third else []
+        parts.append(_HEAD.pack(config.time_base_flags << 24 | config.time_base, len(config.stations)))
+        parts += [_write_station3(station) if third else _write_station2(station) for station in config.stations]
+        parts.append(_I16.pack(config.data_rate))
+    except struct.error as error:
+        raise EncodeError(f"configuration of {config.idcode}: {error}") from None
+    return b"".join(parts)
+
+
+def _labels(station: Station, encode: Callable[[str, bytes | None], bytes]) -> bytes:
+    names = [encode(phasor.name, phasor.wire_name) for phasor in station.phasors]
+    names += [encode(analog.name, analog.wire_name) for analog in station.analogs]
+    for word in station.digitals:
+        if len(word.labels) != LABELS_PER_WORD:
+            raise EncodeError(f"station {station.name!r}: a digital word has {len(word.labels)} labels, not 16")
+        names += [encode(label, raw) for label, raw in zip(word.labels, word.wire_names, strict=True)]
+    return b"".join(names)
+
+
+def _counts(station: Station) -> tuple[int, int, int]:
+    return len(station.phasors), len(station.analogs), len(station.digitals)
+
+
+def _masks(station: Station) -> bytes:
+    return b"".join(_TAIL.pack(word.normal, word.valid) for word in station.digitals)
+
+
+def _write_station2(station: Station) -> bytes:
+    return b"".join(
+        (
+            _encode_name2(station.name, station.wire_name),
+            _BLOCK.pack(station.idcode, station.format, *_counts(station)),
+            _labels(station, _encode_name2),
+            struct.pack(f">{len(station.phasors)}I", *(channel.phunit for channel in station.phasors)),
+            struct.pack(f">{len(station.analogs)}I", *(channel.anunit for channel in station.analogs)),
+            _masks(station),
+            _TAIL.pack(station.fnom, station.cfgcnt),
+        )
+    )
+
+
+def _write_station3(station: Station) -> bytes:
+    details = station.details or StationDetails()
+    if len(details.g_pmu_id) != 16:
+        raise EncodeError(f"station {station.name!r}: G_PMU_ID has {len(details.g_pmu_id)} bytes, not 16")
+    return b"".join(
+        (
+            _encode_name3(station.name, station.wire_name),
+            _U16.pack(station.idcode),
+            details.g_pmu_id,
+            struct.pack(">HHHH", station.format, *_counts(station)),
+            _labels(station, _encode_name3),
+            *(_PHSCALE.pack(*(channel.phscale or _scale_of(channel, station.format))) for channel in station.phasors),
+            *(_ANSCALE.pack(*(channel.anscale or AnalogScale(1.0, 0.0))) for channel in station.analogs),
+            _masks(station),
+            _DETAILS.pack(
+                details.latitude_deg,
+                details.longitude_deg,
+                details.elevation_m,
+                details.service_class.encode("latin-1"),
+                details.window_us,
+                details.group_delay_us,
+            ),
+            _TAIL.pack(station.fnom, station.cfgcnt),
+        )
+    )
+
+
+# --- CFG-2 <-> CFG-3 --------------------------------------------------------------------------------------------
+
+
+def _scale_of(channel: PhasorChannel, fmt: Format) -> PhasorScale:
+    current = PHSCALE_CURRENT if channel.kind == "I" else 0
+    scale = 1.0 if fmt & Format.PHASOR_FLOAT else (channel.phunit & 0xFFFFFF) * 1e-5
+    return PhasorScale(0, current | 1, 0, scale, 0.0)
+
+
+def _station_to_3(station: Station) -> Station:
+    return replace(
+        station,
+        wire_name=None,
+        phasors=tuple(PhasorChannel(c.name, c.phunit, _scale_of(c, station.format)) for c in station.phasors),
+        analogs=tuple(AnalogChannel(c.name, c.anunit, AnalogScale(1.0, 0.0)) for c in station.analogs),
+        digitals=tuple(DigitalWord(w.labels, w.normal, w.valid) for w in station.digitals),
+        details=station.details or StationDetails(),
+    )
+
+
+def cut_name(name: str, size: int = NAME_SIZE) -> str:
+    """``name`` cut to ``size`` bytes of UTF-8, at a character's end."""
+    return name.encode("utf-8")[:size].decode("utf-8", "ignore").rstrip()
+
+
+def _station_to_2(station: Station) -> Station:
+    def phasor(channel: PhasorChannel) -> PhasorChannel:
+        current = (channel.kind == "I") << 24
+        scale = channel.phscale.scale if channel.phscale else 0.0
+        count = round(scale * 1e5) if scale == scale and abs(scale) < 1e9 else 0
+        return PhasorChannel(cut_name(channel.name), current | min(max(count, 0), 0xFFFFFF))
+
+    return replace(
+        station,
+        name=cut_name(station.name),
+        wire_name=None,
+        phasors=tuple(phasor(channel) for channel in station.phasors),
+        analogs=tuple(AnalogChannel(cut_name(c.name), c.anunit) for c in station.analogs),
+        digitals=tuple(
+            DigitalWord(tuple(cut_name(label) for label in w.labels), w.normal, w.valid) for w in station.digitals
+        ),
+        details=None,
+    )

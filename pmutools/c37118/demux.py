@@ -1,0 +1,267 @@
+"""Chunks of any number of flows -> messages: frames together with the configuration they are to be read by.
+
+Configurations are kept per flow and IDCODE. A data frame whose flow has shown none is matched to another flow from
+the same host (commands over TCP with data over UDP) if exactly one fits by IDCODE and size. Data that comes before
+its configuration is held, at most :data:`HELD_BYTES` a stream, and given out when a configuration of the right frame
+size comes; what is still held at the end, or overflows, becomes ``Skipped(NO_CONFIG)``.
+
+A flow that never shows a good frame is not C37.118 traffic: its bytes are counted in ``ignored``, not skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from pmutools.c37118.config import StreamConfig, decode_config, decode_config_body
+from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
+from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason
+from pmutools.c37118.prefix import decode_prefix
+from pmutools.errors import WireError
+from pmutools.flow import Chunk, Flow
+
+HELD_BYTES = 4 << 20
+FRAGMENT_BYTES = 1 << 20
+FLOWS = 1 << 16
+"""Flows remembered at once; the oldest is ended when another comes (a flood of spoofed sources)."""
+_FIRST_FRAGMENT, _LAST_FRAGMENT = 1, 0xFFFF
+
+
+class Message(NamedTuple):
+    """A verified frame. ``config`` is the one in force for a data frame, the decoded one for a configuration frame."""
+
+    frame: Frame
+    flow: Flow
+    config: StreamConfig | None
+
+
+class Loss(NamedTuple):
+    """Bytes of ``flow`` that are in no message."""
+
+    skipped: Skipped
+    flow: Flow
+
+
+@dataclass
+class Tally:
+    """Where the input bytes went: ``fed == framed + skipped + ignored + pending``."""
+
+    fed: int = 0
+    framed: int = 0
+    ignored: int = 0
+    ignored_flows: int = 0
+    frames: dict[FrameType, int] = field(default_factory=dict)
+    skipped: dict[SkipReason, int] = field(default_factory=dict)
+    """Bytes by reason."""
+
+    @property
+    def skipped_bytes(self) -> int:
+        return sum(self.skipped.values())
+
+
+_Place = tuple[str, int]
+"""A host and an IDCODE."""
+
+
+@dataclass
+class _Held:
+    frames: list[Frame] = field(default_factory=list)
+    nbytes: int = 0
+
+
+class _FlowState:
+    def __init__(self, flow: Flow) -> None:
+        self.flow = flow
+        self.host = flow.source.rpartition(":")[0] or flow.source
+        self.framer = Framer(streaming=flow.is_stream)
+        self.configs: dict[int, StreamConfig] = {}
+        self.held: dict[int, _Held] = {}
+        self.fragments: dict[int, tuple[int, bytearray]] = {}
+        self.proven = False
+        self.early: list[Skipped] = []
+        self.early_bytes = 0
+
+
+class Demux:
+    """Feed chunks, get messages; see the module's text. Not thread-safe."""
+
+    def __init__(self, configs: Iterable[StreamConfig] = ()) -> None:
+        """``configs`` are known beforehand, for streams that may never send theirs."""
+        self.tally = Tally()
+        self._saved = {config.idcode: config for config in configs}
+        self._flows: dict[Flow, _FlowState] = {}
+        self._configs: dict[_Place, dict[Flow, StreamConfig]] = {}
+        self._waiting: dict[_Place, dict[Flow, _FlowState]] = {}
+
+    def feed(self, chunk: Chunk) -> list[Message | Loss]:
+        """Messages and losses that this chunk completes."""
+        out: list[Message | Loss] = []
+        state = self._flows.get(chunk.flow)
+        if state is None:
+            if len(self._flows) >= FLOWS:
+                out += self.end(next(iter(self._flows)))
+            state = self._flows[chunk.flow] = _FlowState(chunk.flow)
+        self.tally.fed += len(chunk.data)
+        for item in state.framer.feed(chunk.data, chunk.arrival_ns, chunk.stamp_source, chunk.lost_before):
+            self._take(state, item, out)
+        return out
+
+    def end(self, flow: Flow) -> list[Message | Loss]:
+        """A connection or file is over: frame or skip what is pending in it, and forget it."""
+        out: list[Message | Loss] = []
+        if state := self._flows.pop(flow, None):
+            self._end(state, out)
+        return out
+
+    def close(self) -> list[Message | Loss]:
+        """End of all input."""
+        out: list[Message | Loss] = []
+        for state in self._flows.values():
+            self._end(state, out)
+        self._flows.clear()
+        return out
+
+    @property
+    def pending(self) -> int:
+        """Bytes held back, waiting for more."""
+        return sum(
+            state.framer.pending + state.early_bytes + sum(held.nbytes for held in state.held.values())
+            for state in self._flows.values()
+        )
+
+    def _end(self, state: _FlowState, out: list[Message | Loss]) -> None:
+        for item in state.framer.close():
+            self._take(state, item, out)
+        for idcode, held in state.held.items():
+            self._drop(state, held.frames, out)
+            self._waiting.get((state.host, idcode), {}).pop(state.flow, None)
+        for idcode in state.configs:
+            self._configs.get((state.host, idcode), {}).pop(state.flow, None)
+        if not state.proven and state.early_bytes:
+            self.tally.ignored += state.early_bytes
+            self.tally.ignored_flows += 1
+
+    def _take(self, state: _FlowState, item: Frame | Skipped, out: list[Message | Loss]) -> None:
+        if isinstance(item, Skipped):
+            self._lose(state, item, out)
+            return
+        if not state.proven:
+            state.proven = True
+            early, state.early, state.early_bytes = state.early, [], 0
+            for skipped in early:
+                self._lose(state, skipped, out)
+        kind = item.type
+        if kind is FrameType.DATA:
+            config = state.configs.get(item.idcode)
+            if config is None or config.frame_size != len(item.data):
+                config = self._find_config(state, item)
+                if config is None:
+                    self._hold(state, item, out)
+                    return
+            self._emit(Message(item, state.flow, config), kind, out)
+        elif kind.is_config:
+            self._configure(state, item, kind, out)
+        else:
+            self._emit(Message(item, state.flow, None), kind, out)
+
+    def _emit(self, message: Message, kind: FrameType, out: list[Message | Loss]) -> None:
+        tally = self.tally
+        tally.framed += len(message.frame.data)
+        tally.frames[kind] = tally.frames.get(kind, 0) + 1
+        out.append(message)
+
+    def _lose(self, state: _FlowState, skipped: Skipped, out: list[Message | Loss]) -> None:
+        if not state.proven:
+            if state.early and len(state.early) >= 1024:  # a busy unrelated flow: keep the sum, not the list
+                last = state.early[-1]
+                state.early[-1] = last._replace(nbytes=last.nbytes + skipped.nbytes)
+            else:
+                state.early.append(skipped)
+            state.early_bytes += skipped.nbytes
+            return
+        self.tally.skipped[skipped.reason] = self.tally.skipped.get(skipped.reason, 0) + skipped.nbytes
+        out.append(Loss(skipped, state.flow))
+
+    def _configure(self, state: _FlowState, frame: Frame, kind: FrameType, out: list[Message | Loss]) -> None:
+        config: StreamConfig | None = None
+        try:
+            if kind is FrameType.CFG3 and frame.data[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0":
+                config = self._join(state, frame)
+            else:
+                config = decode_config(frame.data)[1]
+        except WireError:
+            pass  # a good frame whose content is not: it stays a message, with no configuration
+        self._emit(Message(frame, state.flow, config), kind, out)
+        if config is None or kind is FrameType.CFG1:  # CFG-1 says what a device could send, not what it sends
+            return
+        current = state.configs.get(config.idcode)
+        if current is None or current != config:
+            state.configs[config.idcode] = config
+        place = (state.host, config.idcode)
+        self._configs.setdefault(place, {})[state.flow] = state.configs[config.idcode]
+        for other in list(self._waiting.get(place, {}).values()):
+            self._release(other, state.configs[config.idcode], out)
+
+    def _release(self, state: _FlowState, config: StreamConfig, out: list[Message | Loss]) -> None:
+        held = state.held[config.idcode]
+        fitting = [frame for frame in held.frames if len(frame.data) == config.frame_size]
+        held.frames = [frame for frame in held.frames if len(frame.data) != config.frame_size]
+        held.nbytes = sum(len(frame.data) for frame in held.frames)
+        if not held.frames:
+            del self._waiting[state.host, config.idcode][state.flow]
+        for frame in fitting:
+            self._emit(Message(frame, state.flow, config), FrameType.DATA, out)
+
+    def _find_config(self, state: _FlowState, frame: Frame) -> StreamConfig | None:
+        idcode, size = frame.idcode, len(frame.data)
+        known = self._configs.get((state.host, idcode), {})
+        fitting = {config for config in known.values() if config.frame_size == size}
+        if not fitting and (saved := self._saved.get(idcode)) and saved.frame_size == size:
+            fitting = {saved}
+        if len(fitting) != 1:
+            return None
+        config = fitting.pop()
+        if idcode not in state.configs:
+            state.configs[idcode] = config
+        return config
+
+    def _hold(self, state: _FlowState, frame: Frame, out: list[Message | Loss]) -> None:
+        held = state.held.setdefault(frame.idcode, _Held())
+        self._waiting.setdefault((state.host, frame.idcode), {})[state.flow] = state
+        if held.nbytes + len(frame.data) > HELD_BYTES:
+            self._drop(state, [frame], out)
+            return
+        held.frames.append(frame)
+        held.nbytes += len(frame.data)
+
+    def _drop(self, state: _FlowState, frames: list[Frame], out: list[Message | Loss]) -> None:
+        for frame in frames:
+            self._lose(state, Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data)), out)
+
+    def _join(self, state: _FlowState, frame: Frame) -> StreamConfig | None:
+        """Collect CFG-3 fragments that each have their own CHK; the configuration once the last one is there.
+
+        The standard does not say how a CFG-3 is cut; here the payloads behind CONT_IDX are laid end to end.
+        """
+        prefix = decode_prefix(frame.data)
+        index = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + 2], "big")
+        part = frame.data[PREFIX_SIZE + 2 : -CHK_SIZE]
+        expected, body = state.fragments.pop(prefix.idcode, (_FIRST_FRAGMENT, bytearray()))
+        if index == _FIRST_FRAGMENT:
+            expected, body = _FIRST_FRAGMENT, bytearray()
+        last = index == _LAST_FRAGMENT
+        if (index != expected and not (last and body)) or len(body) + len(part) > FRAGMENT_BYTES:
+            return None
+        body += part
+        if not last:
+            state.fragments[prefix.idcode] = (index + 1, body)
+            return None
+        return decode_config_body(prefix, b"\0\0" + bytes(body))
+
+
+def messages(chunks: Iterable[Chunk], demux: Demux) -> Iterator[Message | Loss]:
+    """All of ``chunks`` through ``demux``, to the end."""
+    for chunk in chunks:
+        yield from demux.feed(chunk)
+    yield from demux.close()

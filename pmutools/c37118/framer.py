@@ -1,0 +1,199 @@
+"""Bytes of one flow -> frames and counted skips, nothing between.
+
+A C37.118 stream has no delimiters: a frame is found by SYNC, FRAMESIZE and CHK. Whatever is not part of a good frame
+becomes a :class:`Skipped`, so frame bytes plus skipped bytes always equal the bytes fed in. After a bad frame the
+search goes on one byte past its SYNC, never at the size it claimed.
+
+The memory of a framer is bounded by one frame (64 KiB). A false SYNC that claims a long frame could hide the good
+frames behind it until that many bytes have come; so while an unproven candidate is incomplete, a complete good frame
+behind it whose first six bytes (SYNC, FRAMESIZE, IDCODE) this flow has shown before ends the wait.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from pmutools.c37118.checksum import chk
+from pmutools.c37118.constants import MIN_FRAME_SIZE, FrameType
+from pmutools.flow import StampSource
+
+
+class SkipReason(StrEnum):
+    """Why bytes are not part of a frame."""
+
+    NO_SYNC = "no-sync"
+    BAD_TYPE = "bad-type"
+    BAD_SIZE = "bad-size"
+    BAD_CHK = "bad-chk"
+    TRUNCATED = "truncated"
+    UNSUPPORTED = "unsupported-version"
+    """A whole frame of the 2024 message set (version 3), skipped by its FRAMESIZE."""
+    NO_CONFIG = "no-config"
+    """A good data frame for which no fitting configuration came."""
+
+
+class Frame(NamedTuple):
+    """One verified frame. ``offset`` counts the flow's bytes before it."""
+
+    data: bytes
+    arrival_ns: int | None
+    stamp_source: StampSource
+    offset: int
+
+    @property
+    def type(self) -> FrameType:
+        return _TYPES[self.data[1] >> 4]
+
+    @property
+    def idcode(self) -> int:
+        return self.data[4] << 8 | self.data[5]
+
+
+class Skipped(NamedTuple):
+    """A run of bytes that is no frame, with the first cause met in it."""
+
+    reason: SkipReason
+    offset: int
+    nbytes: int
+
+
+_TYPES = tuple(FrameType)
+_AA = 0xAA
+_COMMAND_SIZE = 18
+_KNOWN_HEADS = 64
+"""How many distinct (SYNC, FRAMESIZE, IDCODE) a flow remembers as proven."""
+
+
+class Framer:
+    """Finds frames in the bytes of one flow.
+
+    ``streaming`` is true where a frame may continue in the next feed (TCP, files); datagrams carry nothing over.
+    Not thread-safe: one flow, one framer, one caller.
+    """
+
+    def __init__(self, *, streaming: bool) -> None:
+        self.streaming = streaming
+        self._buffer = b""
+        self._offset = 0
+        self._heads: dict[bytes, None] = {}
+        self._open: Skipped | None = None
+
+    @property
+    def pending(self) -> int:
+        """Bytes held back, waiting for the rest of a frame."""
+        return len(self._buffer)
+
+    def feed(
+        self,
+        data: bytes,
+        arrival_ns: int | None = None,
+        stamp_source: StampSource = StampSource.CAPTURE,
+        lost_before: int = 0,
+    ) -> list[Frame | Skipped]:
+        """Take in bytes; give back, in order, what is now known. A frame carries the arrival of its last byte.
+
+        ``lost_before`` says that so many bytes of the flow are missing before ``data``: what was held back is given
+        up, and offsets go on counting the bytes seen.
+        """
+        if not self._buffer and not lost_before:
+            size = len(data)
+            if (
+                size >= MIN_FRAME_SIZE
+                and data[2] << 8 | data[3] == size
+                and self._open is None
+                and data[:6] in self._heads
+                and not chk(data)
+            ):  # the usual case: one whole frame of a kind seen before
+                frame = Frame(data, arrival_ns, stamp_source, self._offset)
+                self._offset += size
+                return [frame]
+        out: list[Frame | Skipped] = []
+        if lost_before:
+            self._scan(out, None, stamp_source, final=True)
+        self._buffer = self._buffer + data if self._buffer else bytes(data)
+        self._scan(out, arrival_ns, stamp_source, final=not self.streaming)
+        return out
+
+    def close(self) -> list[Frame | Skipped]:
+        """End of the flow: what was held back is framed or skipped."""
+        out: list[Frame | Skipped] = []
+        self._scan(out, None, StampSource.CAPTURE, final=True)
+        return out
+
+    def _scan(
+        self, out: list[Frame | Skipped], arrival_ns: int | None, stamp_source: StampSource, *, final: bool
+    ) -> None:
+        buffer, at, end = self._buffer, 0, len(self._buffer)
+        while at < end:
+            reason, size = self._judge(buffer, at, end, final)
+            if not size:
+                break
+            if reason is None:
+                self._close_run(out)
+                frame = buffer[at : at + size] if size < end else buffer
+                out.append(Frame(frame, arrival_ns, stamp_source, self._offset + at))
+            elif reason is SkipReason.UNSUPPORTED:  # whole frames: each a record of its own
+                self._close_run(out)
+                out.append(Skipped(reason, self._offset + at, size))
+            else:
+                self._skip(reason, self._offset + at, size)
+            at += size
+        self._buffer = buffer[at:]
+        self._offset += at
+        if final or not self._buffer:
+            self._close_run(out)
+
+    def _judge(self, buffer: bytes, at: int, end: int, final: bool) -> tuple[SkipReason | None, int]:
+        """What begins at ``at``: (None, size) a frame, (reason, n) n bytes to skip, (None, 0) more bytes needed."""
+        if buffer[at] != _AA:
+            sync = buffer.find(b"\xaa", at, end)
+            return SkipReason.NO_SYNC, (sync if sync >= 0 else end) - at
+        if end - at < 4:
+            return (SkipReason.TRUNCATED, 1) if final else (None, 0)
+        second = buffer[at + 1]
+        size = buffer[at + 2] << 8 | buffer[at + 3]
+        newer = second & 0x80 and second & 0xF == 3
+        if not newer and (second & 0x80 or second >> 4 >= len(_TYPES)):
+            return SkipReason.BAD_TYPE, 1
+        if size < (_COMMAND_SIZE if second >> 4 == FrameType.COMMAND else MIN_FRAME_SIZE):
+            return SkipReason.BAD_SIZE, 1
+        if at + size > end:
+            if final:
+                return SkipReason.TRUNCATED, 1
+            hidden = self._proven_behind(buffer, at, end)
+            return (SkipReason.BAD_SIZE, hidden - at) if hidden else (None, 0)
+        if chk(buffer[at : at + size]):
+            return SkipReason.BAD_CHK, 1
+        if newer:
+            return SkipReason.UNSUPPORTED, size
+        head = buffer[at : at + 6]
+        if head not in self._heads:
+            while len(self._heads) >= _KNOWN_HEADS:
+                del self._heads[next(iter(self._heads))]
+            self._heads[head] = None
+        return None, size
+
+    def _proven_behind(self, buffer: bytes, at: int, end: int) -> int:
+        """Where a complete good frame of a proven kind begins behind an unproven candidate; 0 if there is none."""
+        if buffer[at : at + 6] in self._heads:
+            return 0
+        first = 0
+        for head in self._heads:
+            size = head[2] << 8 | head[3]
+            found = buffer.find(head, at + 1, end)
+            while found >= 0 and found + size <= end:
+                if not chk(buffer[found : found + size]):
+                    first = min(first, found) if first else found
+                    break
+                found = buffer.find(head, found + 1, end)
+        return first
+
+    def _skip(self, reason: SkipReason, offset: int, nbytes: int) -> None:
+        run = self._open
+        self._open = Skipped(reason, offset, nbytes) if run is None else run._replace(nbytes=run.nbytes + nbytes)
+
+    def _close_run(self, out: list[Frame | Skipped]) -> None:
+        if self._open is not None:
+            out.append(self._open)
+            self._open = None

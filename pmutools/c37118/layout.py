@@ -1,0 +1,218 @@
+"""Where every value of a data frame lies: one walk over the configuration makes every decoder's layout.
+
+The same list of fields gives the precompiled :class:`struct.Struct` for a live frame, the numpy dtype for a batch,
+the field offsets that fault injection needs, and the fields that the scapy layer shows (clause 6.3, Table 6).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+from pmutools.c37118.config import PhasorChannel, Station, StreamConfig
+from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, Format
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+class Field(NamedTuple):
+    """A run of equal items in a data frame. ``code`` is the struct code of one item, of ``width`` values.
+
+    ``offset`` counts bytes from the frame's start; ``first`` is the place of the first value in the tuple that the
+    layout's struct unpacks.
+    """
+
+    name: str
+    code: str
+    width: int
+    items: int
+    offset: int
+    first: int
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize(">" + self.code) * self.items
+
+
+class PhasorSlot(NamedTuple):
+    """How to read one phasor from unpacked values: at ``first``, times ``factor``, turned by -``angle_offset_rad``."""
+
+    first: int
+    polar: bool
+    floating: bool
+    factor: float
+    angle_offset_rad: float
+
+
+class AnalogSlot(NamedTuple):
+    at: int
+    multiplier: float
+    offset: float
+
+
+class StationSlots(NamedTuple):
+    """Places of one station's values in the unpacked tuple, and its columns in the flat channel lists."""
+
+    stat: int
+    freq: int
+    freq_float: bool
+    fnom_hz: float
+    digitals: range
+    phasor_columns: range
+    analog_columns: range
+    digital_columns: range
+
+
+PREFIX_FIELDS = (
+    Field("sync", "H", 1, 1, 0, 0),
+    Field("framesize", "H", 1, 1, 2, 1),
+    Field("idcode", "H", 1, 1, 4, 2),
+    Field("soc", "I", 1, 1, 6, 3),
+    Field("fracsec", "I", 1, 1, 10, 4),
+)
+"""``fracsec`` here is the whole word: the time quality byte above 24 bits of FRACSEC."""
+
+
+def station_fields(station: Station, offset: int, index: int) -> Iterator[Field]:
+    """The fields of one PMU block that begins at byte ``offset`` and value ``index``."""
+    fmt = station.format
+    phasor = "ff" if fmt & Format.PHASOR_FLOAT else "Hh" if fmt & Format.POLAR else "hh"
+    frequency = "f" if fmt & Format.FREQ_FLOAT else "h"
+    runs = (
+        ("stat", "H", 1),
+        ("phasors", phasor, len(station.phasors)),
+        ("freq", frequency, 1),
+        ("dfreq", frequency, 1),
+        ("analogs", "f" if fmt & Format.ANALOG_FLOAT else "h", len(station.analogs)),
+        ("digitals", "H", len(station.digitals)),
+    )
+    for name, code, count in runs:
+        if count:
+            field = Field(name, code, len(code), count, offset, index)
+            yield field
+            offset += field.size
+            index += field.width * count
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Everything derived from a configuration that decoding its data frames needs."""
+
+    stations: tuple[tuple[Field, ...], ...]
+    unpacker: struct.Struct
+    phasors: tuple[PhasorSlot, ...]
+    analogs: tuple[AnalogSlot, ...]
+    slots: tuple[StationSlots, ...]
+    time_base: int
+
+    @property
+    def frame_size(self) -> int:
+        return self.unpacker.size
+
+
+@lru_cache(maxsize=4096)
+def layout_of(config: StreamConfig) -> Layout:
+    """The layout of ``config``'s data frames, made once a configuration."""
+    offset, index = PREFIX_SIZE, len(PREFIX_FIELDS)
+    stations, phasors, analogs, slots = [], list[PhasorSlot](), list[AnalogSlot](), list[StationSlots]()
+    digital_column = 0
+    for station in config.stations:
+        fields = {field.name: field for field in station_fields(station, offset, index)}
+        first_phasor, first_analog = len(phasors), len(analogs)
+        if "phasors" in fields:
+            at = fields["phasors"].first
+            phasors += [_phasor_slot(channel, station.format, at + 2 * k) for k, channel in enumerate(station.phasors)]
+        for k, channel in enumerate(station.analogs):
+            multiplier, shift = channel.anscale or (1.0, 0.0)
+            analogs.append(AnalogSlot(fields["analogs"].first + k, multiplier, shift))
+        last = fields.get("digitals") or fields.get("analogs") or fields["dfreq"]
+        words = len(station.digitals)
+        first_digital = fields["digitals"].first if words else 0
+        slots.append(
+            StationSlots(
+                fields["stat"].first,
+                fields["freq"].first,
+                bool(station.format & Format.FREQ_FLOAT),
+                station.fnom_hz,
+                range(first_digital, first_digital + words),
+                range(first_phasor, len(phasors)),
+                range(first_analog, len(analogs)),
+                range(digital_column, digital_column + words),
+            )
+        )
+        digital_column += words
+        stations.append(tuple(fields.values()))
+        offset, index = last.offset + last.size, last.first + last.width * last.items
+    codes = [field.code for field in PREFIX_FIELDS]
+    codes += [field.code * field.items for fields_ in stations for field in fields_]
+    return Layout(
+        tuple(stations),
+        struct.Struct(f">{''.join(codes)}H"),
+        tuple(phasors),
+        tuple(analogs),
+        tuple(slots),
+        config.time_base,
+    )
+
+
+def _phasor_slot(channel: PhasorChannel, fmt: Format, index: int) -> PhasorSlot:
+    floating = bool(fmt & Format.PHASOR_FLOAT)
+    if channel.phscale is not None:
+        factor, turn = channel.phscale.scale, channel.phscale.angle_offset_rad
+    else:
+        factor, turn = (1.0 if floating else (channel.phunit & 0xFFFFFF) * 1e-5), 0.0
+    return PhasorSlot(index, bool(fmt & Format.POLAR), floating, factor, turn)
+
+
+_SCALARS = {"H": ">u2", "h": ">i2", "f": ">f4"}
+
+
+@lru_cache(maxsize=4096)
+def dtype_of(config: StreamConfig) -> np.dtype[np.void]:
+    """Big-endian dtype of one data frame; ``itemsize`` is FRAMESIZE.
+
+    Fields ``sync framesize idcode soc fracsec``, one nested ``s0, s1, ...`` a station with ``stat phasors freq dfreq
+    analogs digitals`` (empty ones absent), and ``chk``. Phasors are (P, 2), or ``mag`` and ``angle`` for int polar.
+    """
+    import numpy as np
+
+    columns: list[tuple[str, object]] = [
+        ("sync", ">u2"),
+        ("framesize", ">u2"),
+        ("idcode", ">u2"),
+        ("soc", ">u4"),
+        ("fracsec", ">u4"),
+    ]
+    for number, fields in enumerate(layout_of(config).stations):
+        block: list[tuple[object, ...]] = []
+        for field in fields:
+            if field.name in ("stat", "freq", "dfreq"):
+                block.append((field.name, _SCALARS[field.code]))
+            elif field.code == "Hh":
+                block.append((field.name, [("mag", ">u2"), ("angle", ">i2")], (field.items,)))
+            elif field.width == 2:
+                block.append((field.name, _SCALARS[field.code[0]], (field.items, 2)))
+            else:
+                block.append((field.name, _SCALARS[field.code], (field.items,)))
+        columns.append((f"s{number}", block))
+    columns.append(("chk", ">u2"))
+    dtype: np.dtype[np.void] = np.dtype(columns)
+    assert dtype.itemsize == config.frame_size
+    return dtype
+
+
+def field_at(config: StreamConfig, name: str, station: int = 0) -> Field:
+    """The :class:`Field` called ``name``: a prefix field, ``chk``, or one of a station's; KeyError where absent."""
+    for field in PREFIX_FIELDS:
+        if field.name == name:
+            return field
+    if name == "chk":
+        return Field("chk", "H", 1, 1, config.frame_size - CHK_SIZE, -1)
+    for field in layout_of(config).stations[station]:
+        if field.name == name:
+            return field
+    raise KeyError(name)
