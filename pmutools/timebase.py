@@ -77,3 +77,26 @@ def parse_utc(text: str) -> int:
     day, clock, fraction, zone = match.groups()
     moment = datetime.fromisoformat(f"{day}T{clock}{zone if zone and zone != 'Z' else '+00:00'}")
     return (moment - _EPOCH) // timedelta(seconds=1) * NS + int((fraction or "").ljust(9, "0"))
+
+
+def slots_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
+    """:func:`slot` over a column of shape (N,), for a whole number of frames per second or of seconds per frame."""
+    soc, frac_ns = np.divmod(time_ns, NS)
+    slots: npt.NDArray[np.int64]
+    if rate.denominator == 1:
+        slots = soc * rate.numerator + (frac_ns * rate.numerator + NS // 2) // NS
+    else:
+        slots = (soc + (frac_ns >= NS // 2) + rate.denominator // 2) // rate.denominator
+    return slots
+
+
+def grid_offset_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
+    """Signed distance in ns of each stamp (N,) from its nearest reporting instant, at a rate as in slots_array."""
+    soc, frac_ns = np.divmod(time_ns, NS)
+    offset: npt.NDArray[np.int64]
+    if rate.denominator == 1:
+        nearest = (frac_ns * rate.numerator + NS // 2) // NS
+        offset = frac_ns - (nearest * NS + rate.numerator // 2) // rate.numerator
+    else:
+        offset = time_ns - slots_array(time_ns, rate) * rate.denominator * NS
+    return offset

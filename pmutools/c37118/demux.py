@@ -29,7 +29,11 @@ _FIRST_FRAGMENT, _LAST_FRAGMENT = 1, 0xFFFF
 
 
 class Message(NamedTuple):
-    """A verified frame. ``config`` is the one in force for a data frame, the decoded one for a configuration frame."""
+    """A verified frame.
+
+    ``config`` is the one in force for a data frame, the decoded one for a configuration frame (None if its content is
+    no configuration), and for headers and commands that of their stream, where it is known.
+    """
 
     frame: Frame
     flow: Flow
@@ -64,6 +68,10 @@ _Place = tuple[str, int]
 """A host and an IDCODE."""
 
 
+def _host(endpoint: str) -> str:
+    return endpoint.rpartition(":")[0] or endpoint
+
+
 @dataclass
 class _Held:
     frames: list[Frame] = field(default_factory=list)
@@ -73,7 +81,7 @@ class _Held:
 class _FlowState:
     def __init__(self, flow: Flow) -> None:
         self.flow = flow
-        self.host = flow.source.rpartition(":")[0] or flow.source
+        self.host = _host(flow.source)
         self.framer = Framer(streaming=flow.is_stream)
         self.configs: dict[int, StreamConfig] = {}
         self.held: dict[int, _Held] = {}
@@ -163,7 +171,13 @@ class Demux:
         elif kind.is_config:
             self._configure(state, item, kind, out)
         else:
-            self._emit(Message(item, state.flow, None), kind, out)
+            self._emit(Message(item, state.flow, self._context(state.flow, item)), kind, out)
+
+    def _context(self, flow: Flow, frame: Frame) -> StreamConfig | None:
+        """The configuration of the stream that a header comes from or a command goes to, for its TIME_BASE."""
+        end = flow.destination if frame.type is FrameType.COMMAND else flow.source
+        known = self._configs.get((_host(end), frame.idcode), {})
+        return next(iter(known.values()), None)
 
     def _emit(self, message: Message, kind: FrameType, out: list[Message | Loss]) -> None:
         tally = self.tally

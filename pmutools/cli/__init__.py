@@ -1,0 +1,42 @@
+"""The ``pmu`` command. Each subcommand lives in a module of its own, imported when it is called."""
+
+from __future__ import annotations
+
+import sys
+
+from pmutools.cli.shell import LazyGroup, run
+
+COMMANDS = {
+    "info": ("pmutools.cli.info", "What a recording or a live stream holds, and what is wrong with it."),
+    "dump": ("pmutools.cli.dump", "Every frame, one a line."),
+    "convert": ("pmutools.cli.convert", "Recordings to another format."),
+    "synth": ("pmutools.cli.synth", "A recording made by a simulated grid and its PMUs."),
+    "play": ("pmutools.cli.play", "Stream a recording live, as any number of PMUs."),
+    "read": ("pmutools.cli.read", "Read live streams and log them."),
+}
+
+
+def pmu() -> LazyGroup:
+    """The command group, built without importing any subcommand."""
+    from pmutools import __version__
+
+    return LazyGroup(
+        "pmu",
+        COMMANDS,
+        help="IEEE C37.118 PMU streams: look into them, convert them, play them live, read them live.",
+        version=__version__,
+    )
+
+
+def main() -> None:
+    sys.exit(run(pmu(), sys.argv[1:]))
+
+
+def player() -> None:
+    """``stream-player``: the paper's Advanced Stream Player, ``pmu play``."""
+    sys.exit(run(pmu(), ["play", *sys.argv[1:]], name="stream-player"))
+
+
+def reader() -> None:
+    """``stream-reader``: the paper's StreamReader, ``pmu read``."""
+    sys.exit(run(pmu(), ["read", *sys.argv[1:]], name="stream-reader"))

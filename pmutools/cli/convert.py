@@ -1,0 +1,65 @@
+"""``pmu convert``."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import click
+
+from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.sources import DURATION, parse_idcodes
+
+
+@click.command(name="convert", short_help="Recordings to another format.")
+@click.argument("inputs", nargs=-1, required=True, metavar="IN...")
+@click.argument("output", metavar="OUT")
+@click.option("--start", metavar="T", help="From T: seconds into the source, or ISO-8601 UTC.")
+@click.option("--end", metavar="T", help="Up to T, exclusive.")
+@click.option("--idcode", "idcodes", multiple=True, metavar="N", help="Only this stream; repeatable.")
+@click.option("--phasors", type=click.Choice(("polar", "rect")), default="polar", show_default=True)
+@click.option("--long", "long_form", is_flag=True, help="Tables in long form: one row a value, one file.")
+@DURATION
+@common
+def command(
+    inputs: tuple[str, ...],
+    output: str,
+    start: str | None,
+    end: str | None,
+    idcodes: tuple[str, ...],
+    phasors: str,
+    long_form: bool,
+    duration: float | None,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> int:
+    """Convert recordings; formats are chosen by suffix. Several inputs are merged on time.
+
+    Frames go to frames byte for byte; tables hold SI units and keep the configuration where the format can.
+    """
+    from pmutools.formats import open_sink, open_source
+    from pmutools.tools.convert import convert
+    from pmutools.tools.window import Window, parse_moment
+
+    talk = Talk(quiet, verbose)
+    window = Window(
+        parse_moment(start) if start else None,
+        parse_moment(end) if end else None,
+        None if duration is None else round(duration * 1e9),
+        parse_idcodes(idcodes),
+    )
+    sources = [open_source(path) for path in inputs]
+    with open_sink(output, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
+        result = convert(sources, sink, window)
+    paths = ", ".join(str(path) for path in sink.paths)
+    if as_json:
+        json.dump(result.to_json() | {"paths": [str(path) for path in sink.paths]}, sys.stdout)
+        sys.stdout.write("\n")
+    talk.say(f"{result.frames} data frames of {result.streams} streams -> {paths or output}")
+    for name, count in result.losses.items():
+        talk.say(f"  {name}: {count}")
+    if not result.frames:
+        click.echo(f"pmu convert: no data frames in {', '.join(inputs)} within what was asked for", err=True)
+        return Exit.FAILED
+    return Exit.INCOMPLETE if result.losses else Exit.DONE

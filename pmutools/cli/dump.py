@@ -1,0 +1,50 @@
+"""``pmu dump``."""
+
+from __future__ import annotations
+
+import sys
+from typing import IO
+
+import click
+
+from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.sources import DURATION, TARGET, open_target
+
+TYPES = ("data", "cfg1", "cfg2", "cfg3", "header", "command", "skipped")
+
+
+@click.command(name="dump", short_help="Every frame, one a line.")
+@click.argument("target", type=TARGET)
+@click.option("--type", "types", type=click.Choice(TYPES), multiple=True, help="Only frames of this type; repeatable.")
+@DURATION
+@common
+def command(
+    target: str, types: tuple[str, ...], duration: float | None, as_json: bool, quiet: bool, verbose: int
+) -> int:
+    """Every frame of a FILE or live URL, one a line.
+
+    Exit code 3 says that some bytes could not be read as frames; they are listed as `skipped`.
+    """
+    import json
+
+    from pmutools.c37118.demux import Loss
+    from pmutools.tools.describe import describe, one_line
+
+    talk = Talk(quiet, verbose)
+    skipped = shown = 0
+    out: IO[str] = sys.stdout
+    with open_target(target, duration) as source:
+        for item in source.items():
+            skipped += item.skipped.nbytes if isinstance(item, Loss) else 0
+            described = describe(item)
+            if types and described["type"] not in types:
+                continue
+            shown += 1
+            out.write((json.dumps(described, separators=(",", ":")) if as_json else one_line(described)) + "\n")
+        defects = source.defects()
+    for name, count in defects.items():
+        talk.say(f"{target}: {name}: {count}")
+    if not shown and not skipped:
+        talk.say(f"{target}: no C37.118 frames found" + (f" of type {', '.join(types)}" if types else ""))
+        return Exit.DONE if types else Exit.FAILED
+    return Exit.INCOMPLETE if skipped or defects else Exit.DONE

@@ -1,0 +1,79 @@
+"""Opening what the user named: a file, or the URL of a live stream."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmutools.errors import SettingsError
+
+if TYPE_CHECKING:
+    from pmutools.c37118.demux import Loss, Message
+    from pmutools.formats.source import Block, Source
+
+TARGET = str
+"""A path, or an endpoint URL."""
+
+
+def _seconds(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not 0 < value < 1e9:
+        raise click.BadParameter("must be a number of seconds above 0", ctx, param)
+    return value
+
+
+DURATION = click.option(
+    "--duration",
+    type=float,
+    callback=_seconds,
+    metavar="S",
+    help="Stop after S seconds: wall time for a live stream, stream time for a file.",
+)
+
+
+@contextmanager
+def open_target(target: str, duration: float | None) -> Iterator[Source]:
+    """A file's source, cut to ``duration`` seconds of stream time, or a live one that ends after that wall time."""
+    if "://" in target:
+        from pmutools.tools.live import LiveSource
+
+        with LiveSource([target], duration_s=duration) as live:
+            yield live
+        return
+    from pmutools.formats import open_source
+
+    source = open_source(target)
+    yield source if duration is None else _Cut(source, duration)
+
+
+class _Cut:
+    """A source whose data frames end ``duration`` seconds after the first."""
+
+    def __init__(self, source: Source, duration: float) -> None:
+        self._source, self._duration_ns = source, round(duration * 1e9)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def items(self) -> Iterator[Message | Loss]:
+        from pmutools.tools.window import Window
+
+        return Window(duration_ns=self._duration_ns).items(self._source.items())
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        from pmutools.tools.window import Window
+
+        return Window(duration_ns=self._duration_ns).blocks(self._source.blocks())
+
+
+def parse_idcodes(values: tuple[str, ...]) -> frozenset[int]:
+    """IDCODEs as given on a command line."""
+    try:
+        codes = frozenset(int(value, 0) for value in values)
+    except ValueError as error:
+        raise SettingsError(f"--idcode: {error}; give a number from 1 to 65534") from None
+    if bad := [code for code in codes if not 0 <= code <= 0xFFFF]:
+        raise SettingsError(f"--idcode {bad[0]}: an IDCODE is a number from 1 to 65534")
+    return codes

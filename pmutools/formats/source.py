@@ -1,0 +1,182 @@
+"""Recordings, opened: one interface for files of bytes (captures, raw frames) and files of numbers (tables).
+
+A source gives the same content in two forms: :meth:`Source.items`, frame by frame in the order recorded, and
+:meth:`Source.blocks`, data frames gathered into column batches. Both hold a bounded part of the file in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch, decode_batch, encode_batch
+from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.constants import FrameType
+from pmutools.c37118.demux import Demux, Loss, Message, Tally
+from pmutools.c37118.framer import Frame
+from pmutools.flow import Chunk, Flow, StampSource
+from pmutools.timebase import from_ns
+
+BLOCK_FRAMES = 8192
+
+
+class Block(NamedTuple):
+    """Consecutive data frames of one stream: one flow, one IDCODE, one configuration."""
+
+    flow: Flow
+    batch: Batch
+
+
+class Source(Protocol):
+    """A recording that can be read once."""
+
+    path: Path
+    kind: str
+    """The format found, as in ``pcap`` or ``csv``."""
+    tally: Tally
+
+    def items(self) -> Iterator[Message | Loss]:
+        """Every frame, and every loss, in the order recorded."""
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        """Data frames as blocks; other frames and losses as in :meth:`items`."""
+
+    def defects(self) -> dict[str, int]:
+        """What the container itself had wrong or unread, by name; only counts above 0."""
+
+
+class ByteSource:
+    """A recording of bytes: chunks in flow order, demultiplexed."""
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        chunks: Iterable[Chunk],
+        defects: Callable[[], dict[str, int]] = dict,
+        configs: Iterable[StreamConfig] = (),
+    ) -> None:
+        self.path, self.kind, self.defects = path, kind, defects
+        self._chunks = chunks
+        self._demux = Demux(configs)
+        self.tally = self._demux.tally
+
+    def items(self) -> Iterator[Message | Loss]:
+        for chunk in self._chunks:
+            yield from self._demux.feed(chunk)
+        yield from self._demux.close()
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        return gather(self.items())
+
+
+class TableSource:
+    """A recording of numbers: blocks whose frames are encoded when frames are asked for."""
+
+    def __init__(self, path: Path, kind: str, blocks: Iterable[Block]) -> None:
+        self.path, self.kind = path, kind
+        self._blocks = blocks
+        self.tally = Tally()
+
+    def defects(self) -> dict[str, int]:
+        return {}
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        for block in self._blocks:
+            self._count(FrameType.DATA, len(block.batch), block.batch.config.frame_size)
+            yield block
+
+    def items(self) -> Iterator[Message | Loss]:
+        shown: dict[tuple[Flow, int], StreamConfig] = {}
+        for block in self._blocks:
+            for message in frames_of(block, shown):
+                self._count(message.frame.type, 1, len(message.frame.data))
+                yield message
+
+    def _count(self, kind: FrameType, frames: int, size: int) -> None:
+        self.tally.frames[kind] = self.tally.frames.get(kind, 0) + frames
+        self.tally.framed += frames * size
+        self.tally.fed += frames * size
+
+
+def frames_of(block: Block, shown: dict[tuple[Flow, int], StreamConfig]) -> Iterator[Message]:
+    """The block's frames as messages, its configuration first where ``shown`` lacks it; ``shown`` is updated."""
+    flow, batch = block
+    config = batch.config
+    if not len(batch):
+        return
+    octets = batch.wire if batch.wire is not None else encode_batch(batch)[0]
+    raw, size = octets.tobytes(), config.frame_size
+    arrivals = [None if arrival == NO_TIME else arrival for arrival in batch.arrival_ns.tolist()]
+    sources = batch.stamp_source.tolist()
+    if shown.get((flow, config.idcode)) != config:
+        shown[flow, config.idcode] = config
+        soc, fracsec = from_ns(int(batch.time_ns[0]), config.time_base)
+        frame = Frame(encode_config(config, soc=soc, fracsec=fracsec), arrivals[0], STAMP_SOURCES[sources[0]], 0)
+        yield Message(frame, flow, config)
+    for row, arrival in enumerate(arrivals):
+        data = raw[row * size : (row + 1) * size]
+        yield Message(Frame(data, arrival, STAMP_SOURCES[sources[row]], row * size), flow, config)
+
+
+class _Run:
+    """Data frames of one stream, waiting to become a block."""
+
+    __slots__ = ("arrivals", "config", "frames", "sources")
+
+    def __init__(self, config: StreamConfig) -> None:
+        self.config = config
+        self.frames: list[bytes] = []
+        self.arrivals: list[int] = []
+        self.sources: list[StampSource] = []
+
+    def block(self, flow: Flow) -> Block:
+        codes = {source: STAMP_SOURCES.index(source) for source in set(self.sources)}
+        stamps = [codes[source] for source in self.sources] if len(codes) > 1 else next(iter(codes.values()))
+        return Block(flow, decode_batch(b"".join(self.frames), self.config, self.arrivals, stamps, check=False))
+
+
+class Gatherer:
+    """Gathers data messages into blocks, stream by stream; live tools flush it when they like."""
+
+    def __init__(self, frames: int = BLOCK_FRAMES) -> None:
+        self.frames = frames
+        self._runs: dict[tuple[Flow, int], _Run] = {}
+
+    def add(self, message: Message) -> Block | None:
+        """Take a data message; a block comes back when one is full or the stream's configuration changed."""
+        frame, flow, config = message
+        assert config is not None
+        key = (flow, config.idcode)
+        run = self._runs.get(key)
+        block = None
+        if run is None or run.config is not config:
+            if run is not None and run.config != config:
+                block, run = run.block(flow), None
+            if run is None:
+                run = self._runs[key] = _Run(config)
+        run.frames.append(frame.data)
+        run.arrivals.append(NO_TIME if frame.arrival_ns is None else frame.arrival_ns)
+        run.sources.append(frame.stamp_source)
+        if block is None and len(run.frames) >= self.frames:
+            block = self._runs.pop(key).block(flow)
+        return block
+
+    def flush(self) -> Iterator[Block]:
+        """All that is waiting."""
+        runs, self._runs = self._runs, {}
+        for (flow, _), run in runs.items():
+            yield run.block(flow)
+
+
+def gather(items: Iterable[Message | Loss], frames: int = BLOCK_FRAMES) -> Iterator[Block | Message | Loss]:
+    """Data messages gathered into blocks of up to ``frames``; everything else passes through."""
+    gatherer = Gatherer(frames)
+    for item in items:
+        if isinstance(item, Message) and item.frame.type is FrameType.DATA:
+            if (block := gatherer.add(item)) is not None:
+                yield block
+        else:
+            yield item
+    yield from gatherer.flush()

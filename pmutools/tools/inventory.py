@@ -1,0 +1,180 @@
+"""``pmu info``: what a recording holds, stream by stream, and what is wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from pmutools import timebase
+from pmutools.c37118.batch import NO_TIME, Batch
+from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, FrameType, Stat
+from pmutools.c37118.demux import Loss, Message
+from pmutools.flow import Flow
+from pmutools.formats.source import Block, Source
+from pmutools.tools.describe import describe_station
+
+OFF_GRID_SHARE = 0.1
+"""A stamp further than this share of a period from its reporting instant is off the grid."""
+
+
+@dataclass
+class StreamInventory:
+    """Counts of one stream's data frames; times in ns, absent until a frame came."""
+
+    flow: Flow
+    idcode: int
+    config: StreamConfig
+    config_changes: int = 0
+    frames: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    first_arrival_ns: int | None = None
+    last_arrival_ns: int | None = None
+    gaps: int = 0
+    missing: int = 0
+    duplicates: int = 0
+    backwards: int = 0
+    off_grid: int = 0
+    data_error: int = 0
+    not_synchronised: int = 0
+    invalid: int = 0
+    time_quality: dict[int, int] = field(default_factory=dict)
+    _last_slot: int | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Count a batch that follows all before it."""
+        if batch.config != self.config:
+            self.config, self.config_changes, self._last_slot = batch.config, self.config_changes + 1, None
+        if not self.frames:
+            self.first_ns = int(batch.time_ns[0])
+        self.frames += len(batch)
+        self.last_ns = int(batch.time_ns[-1])
+        seen = batch.arrival_ns[batch.arrival_ns != NO_TIME]
+        if len(seen):
+            self.first_arrival_ns = int(seen[0]) if self.first_arrival_ns is None else self.first_arrival_ns
+            self.last_arrival_ns = int(seen[-1])
+        self.data_error += int(np.count_nonzero((batch.stat & STAT_DATA_ERROR_MASK).any(axis=1)))
+        self.not_synchronised += int(np.count_nonzero((batch.stat & Stat.NOT_SYNCHRONISED).any(axis=1)))
+        self.invalid += int(np.count_nonzero(~batch.valid.all(axis=1)))
+        for code, count in zip(*np.unique(batch.time_quality & 0xF, return_counts=True), strict=True):
+            self.time_quality[int(code)] = self.time_quality.get(int(code), 0) + int(count)
+        if self.config.rate:
+            self._count_slots(batch, self.config.rate)
+
+    def _count_slots(self, batch: Batch, rate: Fraction) -> None:
+        slots = timebase.slots_array(batch.time_ns, rate)
+        before = slots[:1] - 1 if self._last_slot is None else np.array([self._last_slot])
+        steps = np.diff(np.concatenate((before, slots)))
+        self.gaps += int(np.count_nonzero(steps > 1))
+        self.missing += int((steps[steps > 1] - 1).sum())
+        self.duplicates += int(np.count_nonzero(steps == 0))
+        self.backwards += int(np.count_nonzero(steps < 0))
+        limit_ns = OFF_GRID_SHARE * timebase.NS / float(rate)
+        self.off_grid += int(np.count_nonzero(np.abs(timebase.grid_offset_array(batch.time_ns, rate)) > limit_ns))
+        self._last_slot = int(slots[-1])
+
+    @property
+    def measured_hz(self) -> float | None:
+        """Frames per second over the span of the stamps; None for fewer than two frames."""
+        span = self.last_ns - self.first_ns
+        return (self.frames - 1) * timebase.NS / span if self.frames > 1 and span > 0 else None
+
+    def to_json(self) -> dict[str, Any]:
+        rate = self.config.rate
+        return {
+            "idcode": self.idcode,
+            "transport": self.flow.transport,
+            "source": self.flow.source,
+            "destination": self.flow.destination,
+            "connection": self.flow.connection,
+            "config": self.config.kind.name.lower(),
+            "rate_hz": float(rate),
+            "measured_hz": self.measured_hz,
+            "time_base": self.config.time_base,
+            "frame_size": self.config.frame_size,
+            "frames": self.frames,
+            "first": timebase.format_utc(self.first_ns) if self.frames else None,
+            "last": timebase.format_utc(self.last_ns) if self.frames else None,
+            "first_ns": self.first_ns if self.frames else None,
+            "last_ns": self.last_ns if self.frames else None,
+            "span_s": (self.last_ns - self.first_ns) / timebase.NS,
+            "first_arrival_ns": self.first_arrival_ns,
+            "last_arrival_ns": self.last_arrival_ns,
+            "gaps": self.gaps,
+            "missing": self.missing,
+            "duplicates": self.duplicates,
+            "backwards": self.backwards,
+            "off_grid": self.off_grid,
+            "config_changes": self.config_changes,
+            "data_error": self.data_error,
+            "not_synchronised": self.not_synchronised,
+            "invalid": self.invalid,
+            "time_quality": {f"{code:X}": count for code, count in sorted(self.time_quality.items())},
+            "stations": [describe_station(station) for station in self.config.stations],
+        }
+
+
+@dataclass
+class Inventory:
+    """All streams of a recording, and where its bytes went."""
+
+    path: str
+    kind: str
+    streams: list[StreamInventory]
+    frames: dict[FrameType, int]
+    bytes_in: int
+    skipped: dict[str, int]
+    ignored_bytes: int
+    ignored_flows: int
+    defects: dict[str, int]
+
+    @property
+    def damaged(self) -> bool:
+        """Whether input bytes were lost or undecodable."""
+        return bool(self.skipped) or bool(self.defects)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "path": self.path,
+            "kind": self.kind,
+            "frames": {kind.name.lower(): count for kind, count in sorted(self.frames.items())},
+            "bytes": self.bytes_in,
+            "skipped": self.skipped,
+            "ignored_bytes": self.ignored_bytes,
+            "ignored_flows": self.ignored_flows,
+            "defects": self.defects,
+            "streams": [stream.to_json() for stream in self.streams],
+        }
+
+
+def take_inventory(source: Source) -> Inventory:
+    """Read a source to its end and count what is in it."""
+    streams: dict[tuple[Flow, int], StreamInventory] = {}
+    for item in source.blocks():
+        if isinstance(item, Loss):
+            continue
+        if isinstance(item, Message):
+            if item.config is not None and item.frame.type is not FrameType.CFG1:
+                key = (item.flow, item.config.idcode)
+                streams.setdefault(key, StreamInventory(item.flow, item.config.idcode, item.config))
+            continue
+        block: Block = item
+        config = block.batch.config
+        key = (block.flow, config.idcode)
+        streams.setdefault(key, StreamInventory(block.flow, config.idcode, config)).add(block.batch)
+    tally = source.tally
+    return Inventory(
+        str(source.path),
+        source.kind,
+        list(streams.values()),
+        dict(tally.frames),
+        tally.fed,
+        {str(reason): count for reason, count in tally.skipped.items()},
+        tally.ignored,
+        tally.ignored_flows,
+        source.defects(),
+    )
