@@ -1,0 +1,147 @@
+"""The one table that every logged message is made from: protobuf descriptors, ``.proto`` text and documentation.
+
+A field's number is its place in the list, so: append only, never reorder, never reuse, never change a type.
+Readers of either age then read each other's logs (protobuf's own rule). Times are POSIX UTC in nanoseconds;
+frequency is absolute; a number that is unknown is NaN; lists of one message run in parallel.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+FieldType = Literal["int64", "uint64", "int32", "uint32", "double", "bool", "string", "bytes"]
+
+PACKAGE = "pmutools"
+FILE_NAME = "pmutools.proto"
+
+
+class Field(NamedTuple):
+    """One field of a message; ``unit`` is empty where there is none."""
+
+    name: str
+    type: FieldType
+    doc: str
+    unit: str = ""
+    repeated: bool = False
+
+
+class MessageType(NamedTuple):
+    """One message: where it is logged (``topic``), what it says, and its fields in order of their numbers."""
+
+    topic: str
+    doc: str
+    fields: tuple[Field, ...]
+
+
+_TICK = Field("tick_ns", "int64", "Tick that this belongs to.", "ns")
+
+MESSAGES: dict[str, MessageType] = {
+    "PmuFrame": MessageType(
+        "/pmu/NAME/frame",
+        "One data frame of one PMU, as received. Its configuration frame is an attachment that precedes it.",
+        (
+            Field("time_ns", "int64", "Time of measurement, from SOC and FRACSEC.", "ns"),
+            Field("arrival_ns", "int64", "Time of arrival; 0 where unknown.", "ns"),
+            Field("tick_ns", "int64", "Control tick that consumed the frame; 0 for none.", "ns"),
+            Field("stamp_source", "string", "Who took arrival_ns: hardware, kernel, kernel-batched, user, capture."),
+            Field("wire", "bytes", "The C37.118 frame, every byte of it."),
+            Field("time_base", "uint32", "Ticks of FRACSEC per second: how finely time_ns could be stamped.", "1/s"),
+            Field("stat", "uint32", "STAT of the PMU's station."),
+            Field("time_quality", "uint32", "Time quality byte: leap flags and MSG_TQ."),
+            Field("v1_re", "double", "Positive-sequence voltage, real part.", "V"),
+            Field("v1_im", "double", "Positive-sequence voltage, imaginary part.", "V"),
+            Field("frequency_hz", "double", "FREQ of the PMU's station.", "Hz"),
+            Field("rocof_hz_s", "double", "DFREQ of the PMU's station.", "Hz/s"),
+            Field("phasor_re", "double", "All phasors of the frame in order, real parts.", "V or A RMS", True),
+            Field("phasor_im", "double", "All phasors of the frame in order, imaginary parts.", "V or A RMS", True),
+            Field("analog", "double", "All analogs of the frame in order.", "", True),
+            Field("digital", "uint32", "All digital status words of the frame in order.", "", True),
+            Field("station_stat", "uint32", "STAT of each station, where the frame has several.", "", True),
+            Field("station_frequency_hz", "double", "FREQ of each station, where there are several.", "Hz", True),
+            Field("station_rocof_hz_s", "double", "DFREQ of each station, where there are several.", "Hz/s", True),
+        ),
+    ),
+    "Tick": MessageType(
+        "/dcon/tick",
+        "What one control tick decided. Names of PMUs, instances and flags are metadata of the channel.",
+        (
+            Field("tick_ns", "int64", "The tick's nominal time.", "ns"),
+            Field("state", "string", "OFF, INIT, STANDBY, ARMED, ACTIVE, RAMPDOWN, FAULT or ESTOP."),
+            Field("mode", "string", "open_loop or closed_loop."),
+            Field("active", "int32", "Index of the active instance; -1 for none."),
+            Field("active_instance", "string", "Name of the active instance; empty for none."),
+            Field("gain_mw_per_mhz", "double", "Gain in force.", "MW/mHz"),
+            Field("delta_f_mhz", "double", "Frequency difference north minus south of the active instance.", "mHz"),
+            Field("command_mw", "double", "Command, computed and limited.", "MW"),
+            Field("output_v", "double", "Voltage really driven; 0 in open loop.", "V"),
+            Field("probe_mw", "double", "Probing signal beside the command.", "MW"),
+            Field("flags", "uint64", "Supervisory flags, one bit a check."),
+            Field("f_hz", "double", "Frequency of each PMU by the controller's own filter.", "Hz", True),
+            Field("age_ms", "double", "Tick time minus stamp of each PMU's newest frame.", "ms", True),
+        ),
+    ),
+    "Instance": MessageType(
+        "/dcon/instance",
+        "All controller instances at one tick, best priority first.",
+        (
+            _TICK,
+            Field("state", "string", "DISABLED, INITIALISING, READY or HELD.", "", True),
+            Field("active", "bool", "Whether this instance drives the output.", "", True),
+            Field("delta_f_mhz", "double", "Frequency difference north minus south.", "mHz", True),
+            Field("command_mw", "double", "What the instance alone would command.", "MW", True),
+            Field("reason", "string", "Why it was last disabled; empty if it never was.", "", True),
+        ),
+    ),
+    "Event": MessageType(
+        "/dcon/event",
+        "Something that happened at a tick: a change of state, a switch, a check that fired or cleared.",
+        (
+            _TICK,
+            Field("name", "string", "What happened."),
+            Field("subject", "string", "To whom: a PMU, an instance, or empty for the whole controller."),
+            Field("detail", "string", "Value, limit, or words for the operator."),
+        ),
+    ),
+    "Setting": MessageType(
+        "/dcon/setting",
+        "An operator's order or a changed setting: an input of the tick it names.",
+        (
+            _TICK,
+            Field("name", "string", "The order, e.g. arm, activate, disarm, gain."),
+            Field("value", "double", "Its value; 0 where it takes none."),
+        ),
+    ),
+    "Watchdog": MessageType(
+        "/dcon/watchdog",
+        "State of the independent watchdog.",
+        (
+            Field("time_ns", "int64", "When it was read.", "ns"),
+            Field("relays_closed", "bool", "Whether the output reaches the converter."),
+            Field("estop", "bool", "Emergency stop pressed."),
+            Field("latched", "bool", "Tripped and waiting for a manual reset."),
+            Field("reason", "string", "Why the relays are open; empty where they are closed."),
+            Field("heartbeat", "string", "Components watched.", "", True),
+            Field("heartbeat_age_ms", "double", "Age of each component's last heartbeat.", "ms", True),
+        ),
+    ),
+    "Timing": MessageType(
+        "/dcon/timing",
+        "How one tick ran. Never compared in a replay.",
+        (
+            _TICK,
+            Field("compute_us", "double", "From the tick's start to its command.", "us"),
+            Field("late_us", "double", "From the tick's nominal time to its start.", "us"),
+        ),
+    ),
+    "Pdci": MessageType(
+        "/dcon/pdci",
+        "State of the DC line as last reported.",
+        (
+            _TICK,
+            Field("time_ns", "int64", "Time of the report.", "ns"),
+            Field("power_mw", "double", "Power, north to south.", "MW"),
+            Field("in_service", "bool", "The line transmits and is not blocked."),
+            Field("dcon_enabled", "bool", "The line's own controls accept the command."),
+        ),
+    ),
+}
