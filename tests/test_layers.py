@@ -12,9 +12,10 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = [
     # ground floor, lowest first
-    ["pmutools", "pmutools.errors", "pmutools.flow"],
-    ["pmutools.timebase", "pmutools.clock", "pmutools.linux", "pmutools.parsers"],
-    ["pmutools.settings", "pmutools.pacing"],
+    ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase"],
+    ["pmutools.linux", "pmutools.parsers"],
+    ["pmutools.clock", "pmutools.settings"],
+    ["pmutools.pacing"],
     # the codec, sans-I/O
     ["pmutools.c37118"],
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],

@@ -6,9 +6,9 @@ native columns, :func:`encode_batch` turns columns into frames. Both go by :mod:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from pmutools.c37118.checksum import chk_array
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import INT16_FILLER, STAT_DATA_ERROR_MASK, FrameType
 from pmutools.c37118.frames import RAD_PER_COUNT, Data
-from pmutools.c37118.layout import dtype_of, layout_of
+from pmutools.c37118.layout import Layout, PhasorSlot, Run, block_dtype, dtype_of, layout_of
 from pmutools.errors import ChecksumError, ConfigError, LengthError
 from pmutools.flow import StampSource
 
@@ -151,37 +151,45 @@ def _check(wire: npt.NDArray[np.void], config: StreamConfig) -> None:
         raise ConfigError(f"frame {int(np.argmin(right))} is no data frame of stream {config.idcode}")
 
 
+def _blocks(wire: npt.NDArray[np.void], run: Run) -> npt.NDArray[np.void]:
+    """The PMU blocks of a run of stations laid out alike, as a view (N, R)."""
+    strides = (wire.strides[0], run.size)
+    return np.ndarray((len(wire), run.stations), block_dtype(run.fields), wire, run.offset, strides)
+
+
 def _fill(batch: Batch, rows: slice) -> None:
-    """Convert one block of rows, station by station."""
+    """Convert one piece of rows, run by run."""
     assert batch.wire is not None
     wire, layout = batch.wire[rows], layout_of(batch.config)
     parts = batch.phasors[rows].view(np.float64).reshape(len(wire), -1, 2)
     frequency, rocof, stat = batch.frequency[rows], batch.rocof[rows], batch.stat[rows]
-    for number, (fields_, slots) in enumerate(zip(layout.stations, layout.slots, strict=True)):
-        block, names = wire[f"s{number}"], {field.name for field in fields_}
-        stat[:, number] = block["stat"]
+    for run in layout.runs:
+        blocks, names = _blocks(wire, run), {field.name for field in run.fields}
+        columns = slice(run.first, run.first + run.stations)
+        stat[:, columns] = blocks["stat"]
+        frequency[:, columns], rocof[:, columns] = blocks["freq"], blocks["dfreq"]
+        head = layout.slots[run.first]
+        if not head.freq_float:
+            _scale_frequency(frequency[:, columns], head.fnom_hz, 1000)
+            _scale_frequency(rocof[:, columns], 0.0, 100)
         if "phasors" in names:
-            columns = slice(slots.phasor_columns.start, slots.phasor_columns.stop)
-            _phasors(parts[:, columns], block["phasors"], batch, columns)
-        frequency[:, number], rocof[:, number] = block["freq"], block["dfreq"]
-        if not slots.freq_float:
-            _scale_frequency(frequency[:, number], slots.fnom_hz, 1000)
-            _scale_frequency(rocof[:, number], 0.0, 100)
+            # one plain copy first: casting is fast only over contiguous memory
+            _phasors(parts[:, run.phasors], np.ascontiguousarray(blocks["phasors"]), layout.phasors[run.phasors])
         if "analogs" in names:
-            analogs = slice(slots.analog_columns.start, slots.analog_columns.stop)
-            out = batch.analogs[rows, analogs]
-            out[...] = block["analogs"]
-            scales = [layout.analogs[column] for column in slots.analog_columns]
+            out = batch.analogs[rows, run.analogs]
+            out[...] = blocks["analogs"].reshape(out.shape)
+            scales = layout.analogs[run.analogs]
             if any(scale.multiplier != 1 or scale.offset != 0 for scale in scales):
                 out *= [scale.multiplier for scale in scales]
                 out += [scale.offset for scale in scales]
         if "digitals" in names:
-            words = slots.digital_columns
-            batch.digitals[rows, words.start : words.stop] = block["digitals"]
+            batch.digitals[rows, run.digitals] = blocks["digitals"].reshape(len(wire), -1)
     good = (stat & STAT_DATA_ERROR_MASK) == 0
-    for row, number in np.argwhere(good & np.isnan(frequency)):
-        columns = layout.slots[number].phasor_columns
-        good[row, number] = not np.isnan(batch.phasors[rows][row, columns.start : columns.stop]).all()
+    unknown = np.isnan(frequency)
+    if unknown.any():  # then only phasors can make it valid
+        for row, number in np.argwhere(good & unknown):
+            of_station = layout.slots[number].phasor_columns
+            good[row, number] = not np.isnan(batch.phasors[rows][row, of_station.start : of_station.stop]).all()
     batch.valid[rows] = good
 
 
@@ -194,16 +202,17 @@ def _scale_frequency(column: npt.NDArray[np.float64], base: float, counts: int) 
         column[absent] = np.nan
 
 
-def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], batch: Batch, columns: slice) -> None:
-    """Wire phasors of one station into ``out`` (N, P, 2), as real and imaginary parts in SI units."""
-    slots = layout_of(batch.config).phasors[columns]
+def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], slots: Sequence[PhasorSlot]) -> None:
+    """Wire phasors (N, R, P) of alike stations into ``out`` (N, R*P, 2), as real and imaginary parts in SI units."""
     factor = np.array([slot.factor for slot in slots])
     turn = np.array([slot.angle_offset_rad for slot in slots])
-    floating = slots[0].floating
+    floating, count = slots[0].floating, len(out)
     if slots[0].polar:
         if floating:
-            magnitude, angle, absent = raw[..., 0].astype(float), raw[..., 1].astype(float), None
+            pairs = raw.reshape(count, -1, 2)
+            magnitude, angle, absent = pairs[..., 0].astype(float), pairs[..., 1].astype(float), None
         else:
+            raw = raw.reshape(count, -1)
             magnitude, counts = raw["mag"].astype(float), raw["angle"]
             angle, absent = counts * RAD_PER_COUNT, counts == INT16_FILLER
         magnitude *= factor
@@ -212,7 +221,7 @@ def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], batch: Batch, 
             np.multiply(magnitude, np.cos(angle), out=out[..., 0])
             np.multiply(magnitude, np.sin(angle), out=out[..., 1])
     else:
-        out[...] = raw
+        out[...] = raw.reshape(out.shape)
         absent = None if floating else (out == INT16_FILLER).all(-1)
         if (factor != 1).any():
             out *= factor[:, None]
@@ -234,61 +243,69 @@ def encode_batch(batch: Batch) -> tuple[npt.NDArray[np.uint8], int]:
     soc, fracsec = timebase.from_ns_array(batch.time_ns, config.time_base)
     wire["sync"], wire["framesize"], wire["idcode"] = FrameType.DATA.sync, config.frame_size, config.idcode
     wire["soc"], wire["fracsec"] = soc, fracsec | batch.time_quality.astype(np.int64) << 24
-    clipped = 0
-    for number, (fields_, slots) in enumerate(zip(layout.stations, layout.slots, strict=True)):
-        block, names = wire[f"s{number}"], {field.name for field in fields_}
-        block["stat"] = batch.stat[:, number]
-        if "phasors" in names:
-            columns = slice(slots.phasor_columns.start, slots.phasor_columns.stop)
-            clipped += _put_phasors(block, batch, columns)
-        if slots.freq_float:
-            block["freq"], block["dfreq"] = batch.frequency[:, number], batch.rocof[:, number]
-        else:
-            block["freq"], over = _int16((batch.frequency[:, number] - slots.fnom_hz) * 1000)
-            block["dfreq"], over_rocof = _int16(batch.rocof[:, number] * 100)
-            clipped += over + over_rocof
-        if "analogs" in names:
-            scales = [layout.analogs[column] for column in slots.analog_columns]
-            values = batch.analogs[:, slots.analog_columns.start : slots.analog_columns.stop]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                counts = (values - [scale.offset for scale in scales]) / [scale.multiplier for scale in scales]
-            if block["analogs"].dtype.kind == "i":
-                block["analogs"], over = _int16(counts)
-                clipped += over
-            else:
-                block["analogs"] = counts
-        if "digitals" in names:
-            words = slots.digital_columns
-            block["digitals"] = batch.digitals[:, words.start : words.stop]
     octets = wire.view(np.uint8).reshape(count, config.frame_size)
-    wire["chk"] = chk_array(octets[:, :-2])
+    step = max(1, _BLOCK_BYTES // config.frame_size)
+    clipped = 0
+    for first in range(0, count, step):
+        rows = slice(first, first + step)
+        clipped += sum(_put(wire[rows], batch[rows], layout, run) for run in layout.runs)
+        wire["chk"][rows] = chk_array(octets[rows, :-2])
     return octets, clipped
 
 
-def _put_phasors(block: npt.NDArray[np.void], batch: Batch, columns: slice) -> int:
-    slots = layout_of(batch.config).phasors[columns]
+def _put(wire: npt.NDArray[np.void], batch: Batch, layout: Layout, run: Run) -> int:
+    """Write one piece of rows of one run of stations; how many values were clipped."""
+    blocks, names, clipped = _blocks(wire, run), {field.name for field in run.fields}, 0
+    columns = slice(run.first, run.first + run.stations)
+    head = layout.slots[run.first]
+    blocks["stat"] = batch.stat[:, columns]
+    if head.freq_float:
+        blocks["freq"], blocks["dfreq"] = batch.frequency[:, columns], batch.rocof[:, columns]
+    else:
+        blocks["freq"], over = _int16((batch.frequency[:, columns] - head.fnom_hz) * 1000)
+        blocks["dfreq"], over_rocof = _int16(batch.rocof[:, columns] * 100)
+        clipped += over + over_rocof
+    if "phasors" in names:
+        clipped += _put_phasors(blocks["phasors"], batch.phasors[:, run.phasors], layout.phasors[run.phasors])
+    if "analogs" in names:
+        out, scales = blocks["analogs"], layout.analogs[run.analogs]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shifted = batch.analogs[:, run.analogs] - [scale.offset for scale in scales]
+            counts = (shifted / [scale.multiplier for scale in scales]).reshape(out.shape)
+        if out.dtype.kind == "i":
+            out[...], over = _int16(counts)
+            clipped += over
+        else:
+            out[...] = counts
+    if "digitals" in names:
+        blocks["digitals"] = batch.digitals[:, run.digitals].reshape(blocks["digitals"].shape)
+    return clipped
+
+
+def _put_phasors(out: npt.NDArray[Any], phasors: npt.NDArray[np.complex128], slots: Sequence[PhasorSlot]) -> int:
     factor = np.array([slot.factor for slot in slots])
     turn = np.array([slot.angle_offset_rad for slot in slots])
-    phasors = batch.phasors[:, columns]
-    counts = phasors / np.where(factor == 0, np.inf, factor)  # PHUNIT 0: the count says nothing, send 0
+    if (factor == 1).all():
+        counts = phasors
+    else:
+        counts = phasors / np.where(factor == 0, np.inf, factor)  # PHUNIT 0: the count says nothing, send 0
     if turn.any():
         counts = counts * np.exp(1j * turn)
-    absent = np.isnan(phasors)
-    out = block["phasors"]
-    if slots[0].polar:
-        magnitude, angle = np.abs(counts), np.angle(counts)
+    if not slots[0].polar:
+        parts = np.ascontiguousarray(counts).view(np.float64).reshape(out.shape)
         if slots[0].floating:
-            out[..., 0], out[..., 1] = magnitude, angle
+            out[...] = parts
             return 0
-        magnitude, over = _whole(magnitude, 0, 0xFFFF)
-        out["mag"] = magnitude
-        out["angle"] = np.where(absent, INT16_FILLER, np.rint(np.nan_to_num(angle) / RAD_PER_COUNT))
+        out[...], over = _int16(parts)
         return over
-    parts = cast("npt.NDArray[np.float64]", np.stack((counts.real, counts.imag), axis=-1))
+    shape = out.shape[:3]
+    magnitude, angle = np.abs(counts).reshape(shape), np.angle(counts).reshape(shape)
     if slots[0].floating:
-        out[...] = parts
+        out[..., 0], out[..., 1] = magnitude, angle
         return 0
-    out[...], over = _int16(parts)
+    absent = np.isnan(magnitude)
+    out["mag"], over = _whole(magnitude, 0, 0xFFFF)
+    out["angle"] = np.where(absent, INT16_FILLER, np.rint(np.nan_to_num(angle) / RAD_PER_COUNT))
     return over
 
 

@@ -63,6 +63,12 @@ class Tally:
     def skipped_bytes(self) -> int:
         return sum(self.skipped.values())
 
+    def count(self, kind: FrameType, frames: int, size: int) -> None:
+        """Frames of ``size`` bytes each that came in as such, not found in bytes."""
+        self.frames[kind] = self.frames.get(kind, 0) + frames
+        self.framed += frames * size
+        self.fed += frames * size
+
 
 _Place = tuple[str, int]
 """A host and an IDCODE."""

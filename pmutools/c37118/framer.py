@@ -81,8 +81,8 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Bytes held back, waiting for the rest of a frame."""
-        return len(self._buffer)
+        """Bytes in no item yet: the beginning of a frame, or a run of skipped bytes that may go on."""
+        return len(self._buffer) + (self._open.nbytes if self._open else 0)
 
     def feed(
         self,

@@ -7,7 +7,7 @@ the field offsets that fault injection needs, and the fields that the scapy laye
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -67,6 +67,23 @@ class StationSlots(NamedTuple):
     digital_columns: range
 
 
+class Run(NamedTuple):
+    """Consecutive stations whose blocks are laid out alike, so that they decode as one array of shape (N, R).
+
+    ``first`` and ``stations`` count stations, ``offset`` is the first block's byte, ``size`` a block's bytes. The
+    ranges are columns over all stations of the stream; every station has an equal share of each.
+    """
+
+    first: int
+    stations: int
+    offset: int
+    size: int
+    fields: tuple[Field, ...]
+    phasors: slice
+    analogs: slice
+    digitals: slice
+
+
 PREFIX_FIELDS = (
     Field("sync", "H", 1, 1, 0, 0),
     Field("framesize", "H", 1, 1, 2, 1),
@@ -108,6 +125,7 @@ class Layout:
     analogs: tuple[AnalogSlot, ...]
     slots: tuple[StationSlots, ...]
     time_base: int
+    runs: tuple[Run, ...]
 
     @property
     def frame_size(self) -> int:
@@ -156,7 +174,32 @@ def layout_of(config: StreamConfig) -> Layout:
         tuple(analogs),
         tuple(slots),
         config.time_base,
+        tuple(_runs(config, stations, slots)),
     )
+
+
+def _runs(config: StreamConfig, stations: Sequence[tuple[Field, ...]], slots: Sequence[StationSlots]) -> Iterator[Run]:
+    """Stations laid out alike, gathered; what follows from another FORMAT, count or FNOM begins a new run."""
+    shapes = [
+        (slot.fnom_hz, *((f.name, f.code, f.items) for f in fields))
+        for fields, slot in zip(stations, slots, strict=True)
+    ]
+    first = 0
+    for after in range(1, len(shapes) + 1):
+        if after < len(shapes) and shapes[after] == shapes[first]:
+            continue
+        head, last = slots[first], slots[after - 1]
+        yield Run(
+            first,
+            after - first,
+            stations[first][0].offset,
+            config.stations[first].block_size,
+            stations[first],
+            slice(head.phasor_columns.start, last.phasor_columns.stop),
+            slice(head.analog_columns.start, last.analog_columns.stop),
+            slice(head.digital_columns.start, last.digital_columns.stop),
+        )
+        first = after
 
 
 def _phasor_slot(channel: PhasorChannel, fmt: Format, index: int) -> PhasorSlot:
@@ -171,36 +214,37 @@ def _phasor_slot(channel: PhasorChannel, fmt: Format, index: int) -> PhasorSlot:
 _SCALARS = {"H": ">u2", "h": ">i2", "f": ">f4"}
 
 
+def block_dtype(fields: Sequence[Field]) -> np.dtype[np.void]:
+    """Big-endian dtype of one PMU block: ``stat phasors freq dfreq analogs digitals``, empty ones absent.
+
+    Phasors are (P, 2), or (P,) of ``mag`` and ``angle`` for int polar.
+    """
+    import numpy as np
+
+    columns: list[tuple[object, ...]] = []
+    for field in fields:
+        if field.name in ("stat", "freq", "dfreq"):
+            columns.append((field.name, _SCALARS[field.code]))
+        elif field.code == "Hh":
+            columns.append((field.name, [("mag", ">u2"), ("angle", ">i2")], (field.items,)))
+        elif field.width == 2:
+            columns.append((field.name, _SCALARS[field.code[0]], (field.items, 2)))
+        else:
+            columns.append((field.name, _SCALARS[field.code], (field.items,)))
+    return np.dtype(columns)
+
+
 @lru_cache(maxsize=4096)
 def dtype_of(config: StreamConfig) -> np.dtype[np.void]:
     """Big-endian dtype of one data frame; ``itemsize`` is FRAMESIZE.
 
-    Fields ``sync framesize idcode soc fracsec``, one nested ``s0, s1, ...`` a station with ``stat phasors freq dfreq
-    analogs digitals`` (empty ones absent), and ``chk``. Phasors are (P, 2), or ``mag`` and ``angle`` for int polar.
+    Fields ``sync framesize idcode soc fracsec``, one nested :func:`block_dtype` a station as ``s0, s1, ...``, ``chk``.
     """
     import numpy as np
 
-    columns: list[tuple[str, object]] = [
-        ("sync", ">u2"),
-        ("framesize", ">u2"),
-        ("idcode", ">u2"),
-        ("soc", ">u4"),
-        ("fracsec", ">u4"),
-    ]
-    for number, fields in enumerate(layout_of(config).stations):
-        block: list[tuple[object, ...]] = []
-        for field in fields:
-            if field.name in ("stat", "freq", "dfreq"):
-                block.append((field.name, _SCALARS[field.code]))
-            elif field.code == "Hh":
-                block.append((field.name, [("mag", ">u2"), ("angle", ">i2")], (field.items,)))
-            elif field.width == 2:
-                block.append((field.name, _SCALARS[field.code[0]], (field.items, 2)))
-            else:
-                block.append((field.name, _SCALARS[field.code], (field.items,)))
-        columns.append((f"s{number}", block))
-    columns.append(("chk", ">u2"))
-    dtype: np.dtype[np.void] = np.dtype(columns)
+    head = [("sync", ">u2"), ("framesize", ">u2"), ("idcode", ">u2"), ("soc", ">u4"), ("fracsec", ">u4")]
+    blocks = [(f"s{number}", block_dtype(fields)) for number, fields in enumerate(layout_of(config).stations)]
+    dtype: np.dtype[np.void] = np.dtype([*head, *blocks, ("chk", ">u2")])
     assert dtype.itemsize == config.frame_size
     return dtype
 

@@ -71,6 +71,25 @@ class ByteSource:
         return gather(self.items())
 
 
+class MessageSource:
+    """A recording made as it is read (by a simulation): messages in order."""
+
+    def __init__(self, path: Path, kind: str, messages: Iterable[Message]) -> None:
+        self.path, self.kind, self.tally = path, kind, Tally()
+        self._messages = messages
+
+    def defects(self) -> dict[str, int]:
+        return {}
+
+    def items(self) -> Iterator[Message | Loss]:
+        for message in self._messages:
+            self.tally.count(message.frame.type, 1, len(message.frame.data))
+            yield message
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        return gather(self.items())
+
+
 class TableSource:
     """A recording of numbers: blocks whose frames are encoded when frames are asked for."""
 
@@ -84,20 +103,15 @@ class TableSource:
 
     def blocks(self) -> Iterator[Block | Message | Loss]:
         for block in self._blocks:
-            self._count(FrameType.DATA, len(block.batch), block.batch.config.frame_size)
+            self.tally.count(FrameType.DATA, len(block.batch), block.batch.config.frame_size)
             yield block
 
     def items(self) -> Iterator[Message | Loss]:
         shown: dict[tuple[Flow, int], StreamConfig] = {}
         for block in self._blocks:
             for message in frames_of(block, shown):
-                self._count(message.frame.type, 1, len(message.frame.data))
+                self.tally.count(message.frame.type, 1, len(message.frame.data))
                 yield message
-
-    def _count(self, kind: FrameType, frames: int, size: int) -> None:
-        self.tally.frames[kind] = self.tally.frames.get(kind, 0) + frames
-        self.tally.framed += frames * size
-        self.tally.fed += frames * size
 
 
 def frames_of(block: Block, shown: dict[tuple[Flow, int], StreamConfig]) -> Iterator[Message]:
