@@ -1,0 +1,264 @@
+"""A session in one MCAP file: every tick with the frames and orders it was given, and what it decided.
+
+Which frames a tick consumed is part of the log (``tick_ns`` in each), so a replay groups by tick, never by arrival.
+All messages of a tick lie in one chunk: damage takes whole ticks, and the reader says where.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import IO, Any, NamedTuple
+
+import pmutools
+from dcon.core.values import Inputs, Order, Record, Sample
+from dcon.session import codec
+from dcon.session.codec import Pdci, Timing, Watchdog
+from pmutools.errors import SourceError
+from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
+from pmutools.schema.log_writer import LogWriter
+from pmutools.schema.messages import MESSAGES
+from pmutools.schema.pmu_log import PmuFrame, PmuTopics, config_name, from_message, name_of
+
+SESSION = "session"
+"""Name of the metadata record that makes an MCAP file a session log."""
+INI_NAME = "dcon.ini"
+
+
+class SessionWriter:
+    """Writes a session log; a context manager. All methods raise SourceError where the system refuses to write.
+
+    Parameters
+    ----------
+    target
+        Path, or a seekable binary stream.
+    ini_text
+        The initialisation file in force, attached whole.
+    configs
+        Configuration frame of each PMU, by name; those that come later go to :meth:`config`.
+    metadata
+        Seed, plant, scenario and what else is known of the run, as text; the version is added.
+    pmus, instances, flags
+        Names, in the order of the lists in a :class:`~dcon.core.values.Record` and of the bits in its ``flags``.
+    """
+
+    def __init__(
+        self,
+        target: str | os.PathLike[str] | IO[bytes],
+        *,
+        ini_text: str,
+        configs: Mapping[str, bytes],
+        metadata: Mapping[str, str],
+        pmus: Sequence[str],
+        instances: Sequence[str],
+        flags: Sequence[str] = (),
+    ) -> None:
+        self._log = LogWriter(target)
+        self._pmus = PmuTopics(self._log)
+        self._instances = tuple(instances)
+        names = {
+            "pmus": json.dumps(list(pmus)),
+            "instances": json.dumps(list(instances)),
+            "flags": json.dumps(list(flags)),
+        }
+        self._log.metadata(SESSION, {"version": pmutools.__version__, **metadata, **names})
+        self._log.attach(INI_NAME, ini_text.encode(), media_type="text/plain")
+        for name, frame in configs.items():
+            self._pmus.config(name, frame)
+        self._channels = {
+            name: self._log.channel(message.topic, name, names)
+            for name, message in MESSAGES.items()
+            if message.topic.startswith("/dcon/")
+        }
+
+    def tick(
+        self,
+        record: Record,
+        frames: Iterable[PmuFrame] = (),
+        orders: Iterable[Order] = (),
+        *,
+        timing: Timing | None = None,
+        pdci: Pdci | None = None,
+    ) -> None:
+        """Log one tick: the ``frames`` and ``orders`` it was given, what it decided, how it ran.
+
+        ``frames`` in the order in which the controller got them. Ticks are POSIX times: a frame's tick 0 means none.
+        """
+        tick_ns = record.tick_ns
+        if tick_ns <= 0:
+            raise ValueError(f"tick_ns is {tick_ns}")
+        self._log.checkpoint(tick_ns)
+        for frame in frames:
+            self._pmus.write(frame, tick_ns)
+        for order in orders:
+            self._write("Setting", codec.encode_order(tick_ns, order), tick_ns)
+        self._write("Tick", codec.encode_tick(record, self._instances), tick_ns)
+        self._write("Instance", codec.encode_instances(record), tick_ns)
+        for event in record.events:
+            self._write("Event", codec.encode_event(tick_ns, event), tick_ns)
+        if timing is not None:
+            self._write("Timing", codec.encode_timing(tick_ns, timing), tick_ns)
+        if pdci is not None:
+            self._write("Pdci", codec.encode_pdci(tick_ns, pdci), tick_ns, pdci.time_ns)
+
+    def config(self, name: str, frame: bytes, time_ns: int) -> None:
+        """Attach a configuration frame that came at ``time_ns``."""
+        self._pmus.config(name, frame, time_ns)
+
+    def watchdog(self, watchdog: Watchdog) -> None:
+        self._write("Watchdog", codec.encode_watchdog(watchdog), watchdog.time_ns)
+
+    def flush(self) -> None:
+        """A process killed after this loses nothing that was logged before it."""
+        self._log.flush()
+
+    def close(self) -> None:
+        self._log.close()
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _write(self, message: str, data: bytes, time_ns: int, publish_time_ns: int | None = None) -> None:
+        self._log.write(self._channels[message], data, time_ns, time_ns if publish_time_ns is None else publish_time_ns)
+
+
+class LoggedTick(NamedTuple):
+    """One tick of a session: its inputs and what came of them."""
+
+    record: Record
+    frames: tuple[PmuFrame, ...]
+    orders: tuple[Order, ...]
+    timing: Timing | None
+    pdci: Pdci | None
+    after_loss: bool
+    """Something of the log is missing just before this tick: a replay cannot know the controller's state."""
+
+    def inputs(self, pmus: Sequence[str]) -> Inputs:
+        """What ``step`` was given; ``pmus`` are the names in the order of its parameters."""
+        samples: dict[str, list[Sample]] = {name: [] for name in pmus}
+        for frame in self.frames:
+            if frame.name in samples:
+                samples[frame.name].append(codec.sample_of(frame))
+        return Inputs(tuple(map(tuple, samples.values())), self.orders)
+
+
+@dataclass(slots=True)
+class TickMessages:
+    """The decoded protobuf messages of one tick, by name; frames as (PMU, message)."""
+
+    tick_ns: int
+    after_loss: bool
+    frames: list[tuple[str, Any]] = field(default_factory=list)
+    messages: dict[str, list[Any]] = field(default_factory=dict)
+
+    def one(self, message: str) -> Any | None:
+        """The tick's only message of that name; None where it has none."""
+        return self.messages.get(message, (None,))[0]
+
+
+class SessionReader:
+    """A session log. What precedes the first tick is read at once.
+
+    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``configs`` (first frame of
+    each PMU). ``damage`` and ``incomplete_ticks`` are those of the last iteration, once it is exhausted.
+    Raises SourceError for a file that cannot be read or is no session log.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._log = LogReader(path)
+        self.metadata: dict[str, str] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.incomplete_ticks = 0
+        first_tick = self._read_head()
+        if first_tick is None and not self.metadata:
+            raise SourceError(f"{path}: not a session log (no {SESSION!r} metadata, no tick)")
+        # chunks have a CRC, metadata records have none: the tick channel's word goes first
+        names = self.metadata if first_tick is None else {**self.metadata, **first_tick.channel.metadata}
+        self.pmus = _names(names, "pmus")
+        self.instances = _names(names, "instances")
+        self.flags = _names(names, "flags")
+        self.ini_text = self.attachments.get(INI_NAME, b"").decode(errors="replace")
+        self.configs = {name: data for key, data in self.attachments.items() if (name := config_name(key)) is not None}
+
+    @property
+    def damage(self) -> Damage:
+        return self._log.damage
+
+    def ticks(self) -> Iterator[LoggedTick]:
+        """Every whole tick with its inputs, in file order."""
+        loss = False
+        for group in self.groups(_TICK_MESSAGES):
+            loss |= group.after_loss
+            try:
+                tick = _logged_tick(group, loss)
+            except ValueError:
+                self.incomplete_ticks += 1
+                loss = True
+                continue
+            yield tick
+            loss = False
+
+    def groups(self, messages: Collection[str]) -> Iterator[TickMessages]:
+        """The wanted messages (names of the table) of each tick, decoded; memory is bounded by a tick and a chunk."""
+        self.incomplete_ticks = 0
+        group: TickMessages | None = None
+        losses = 0
+        for entry in self._log.records(messages):
+            if not isinstance(entry, LogMessage) or (message := self._log.decode(entry)) is None:
+                continue
+            if entry.channel.message == "PmuFrame" and not message.tick_ns:
+                continue  # no tick consumed it
+            if group is None or message.tick_ns != group.tick_ns:
+                if group is not None:
+                    yield group
+                group = TickMessages(message.tick_ns, after_loss=self.damage.losses > losses)
+                losses = self.damage.losses
+            if entry.channel.message == "PmuFrame":
+                group.frames.append((name_of(entry.channel.topic), message))
+            else:
+                group.messages.setdefault(str(entry.channel.message), []).append(message)
+        if group is not None:
+            yield group
+
+    def _read_head(self) -> LogMessage | None:
+        """Take in what comes before the first tick, and return that."""
+        for entry in self._log.records({"Tick"}):
+            if isinstance(entry, LogMessage):
+                return entry
+            if isinstance(entry, LogAttachment):
+                self.attachments.setdefault(entry.name, entry.data)
+            elif entry.name == SESSION:
+                self.metadata.update(entry.values)
+        return None
+
+
+_TICK_MESSAGES = frozenset(("PmuFrame", "Setting", "Tick", "Instance", "Event", "Timing", "Pdci"))
+
+
+def _names(metadata: Mapping[str, str], key: str) -> tuple[str, ...]:
+    try:
+        return tuple(map(str, json.loads(metadata.get(key, "[]"))))
+    except (ValueError, TypeError):
+        return ()
+
+
+def _logged_tick(group: TickMessages, after_loss: bool) -> LoggedTick:
+    """Raises ValueError where the tick is not whole."""
+    tick, instance = group.one("Tick"), group.one("Instance")
+    if tick is None or instance is None:
+        raise ValueError(f"tick {group.tick_ns} is not whole")
+    timing, pdci = group.one("Timing"), group.one("Pdci")
+    return LoggedTick(
+        codec.decode_record(tick, instance, group.messages.get("Event", ())),
+        tuple(from_message(name, message) for name, message in group.frames),
+        tuple(Order(order.name, order.value) for order in group.messages.get("Setting", ())),
+        None if timing is None else Timing(timing.compute_us, timing.late_us),
+        None if pdci is None else codec.decode_pdci(pdci),
+        after_loss,
+    )

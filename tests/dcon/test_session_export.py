@@ -1,0 +1,207 @@
+"""``dcon export``: the contract's columns, the log's values, whatever the format."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.sessions import FLAGS, INSTANCES, PERIOD_NS, PMUS, Tick, bits, random_ticks, write_session
+
+from dcon.session import export as export_module
+from dcon.session.export import export
+from pmutools.errors import SettingsError, SourceError
+
+CONTRACT = [
+    *("tick_ns", "state", "mode", "active_instance", "gain_mw_per_mhz", "delta_f_mhz", "command_mw"),
+    *("output_v", "pdci_mw", "flags"),
+    *(f"f_{name}_hz" for name in PMUS),
+    *(f"age_{name}_ms" for name in PMUS),
+    "compute_us",
+    "late_us",
+]
+ADDED = ["probe_mw"]
+TICKS = random_ticks(150)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp("session") / "s.mcap", TICKS)
+
+
+def none_if_nan(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
+
+
+def expected_tick(tick: Tick) -> dict[str, Any]:
+    record = tick.record
+    return {
+        "tick_ns": record.tick_ns,
+        "state": str(record.state),
+        "mode": str(record.mode),
+        "active_instance": None if record.active is None else INSTANCES[record.active],
+        "gain_mw_per_mhz": record.gain_mw_per_mhz,
+        "delta_f_mhz": none_if_nan(record.delta_f_mhz),
+        "command_mw": record.command_mw,
+        "output_v": record.output_v,
+        "pdci_mw": None if tick.pdci is None else none_if_nan(tick.pdci.power_mw),
+        "flags": record.flags,
+        **{f"f_{name}_hz": none_if_nan(value) for name, value in zip(PMUS, record.f_hz, strict=True)},
+        **{f"age_{name}_ms": none_if_nan(value) for name, value in zip(PMUS, record.age_ms, strict=True)},
+        "compute_us": None if tick.timing is None else none_if_nan(tick.timing.compute_us),
+        "late_us": None if tick.timing is None else none_if_nan(tick.timing.late_us),
+        "probe_mw": none_if_nan(record.probe_mw),
+    }
+
+
+def exact(rows: list[dict[str, Any]]) -> list[object]:
+    return [bits(tuple(row.items())) for row in rows]
+
+
+def read_csv(path: Path, columns: dict[str, str]) -> list[dict[str, Any]]:
+    """Rows with values of the types that Parquet gave the columns."""
+    parsers: dict[str, Any] = {"double": float, "string": str, "bool": lambda text: text == "true"}
+    data = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    return [
+        {key: None if text == "" else parsers.get(columns[key], int)(text) for key, text in row.items()}
+        for row in csv.DictReader(data.decode("utf-8").splitlines())
+    ]
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".arrow", ".csv", ".csv.gz", ".jsonl"])
+@pytest.mark.parametrize("table", ["tick", "instance", "pmu", "event"])
+def test_every_format_holds_the_same_rows(
+    session: Path, tmp_path: Path, table: str, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export_module, "BATCH_ROWS", 64)  # several row groups
+    reference = tmp_path / "reference.parquet"
+    summary = export(session, reference, table)
+    rows = pq.read_table(reference).to_pylist()
+    assert summary.rows == len(rows) > 100 and summary.gaps == 0 and not summary.damage
+    assert pq.ParquetFile(reference).metadata.num_row_groups == math.ceil(len(rows) / 64)
+
+    out = tmp_path / f"out{suffix}"
+    assert export(session, out, table).rows == len(rows)
+    if suffix == ".parquet":
+        other = pq.read_table(out).to_pylist()
+    elif suffix == ".arrow":
+        other = pa.ipc.open_file(str(out)).read_all().to_pylist()
+    elif suffix == ".jsonl":
+        other = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
+        rows = [{key: None if value in (math.inf, -math.inf) else value for key, value in row.items()} for row in rows]
+    else:
+        other = read_csv(out, {field.name: str(field.type) for field in pq.read_schema(reference)})
+    assert exact(other) == exact(rows)
+
+
+def test_tick_columns_are_those_of_the_contract(session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "t.parquet"
+    export(session, out)
+    schema = pq.read_schema(out)
+    assert schema.names == CONTRACT + ADDED
+    assert schema.field("flags").type == pa.uint64()
+    assert schema.field("tick_ns").type == pa.int64()
+    assert not schema.field("command_mw").nullable
+    assert json.loads(schema.metadata[b"flags"]) == list(FLAGS)
+    assert json.loads(schema.metadata[b"session"])["scenario"] == "cjb"
+
+
+def test_tick_rows_are_the_records_bit_for_bit(session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "t.parquet"
+    export(session, out)
+    table = pq.read_table(out)
+    assert exact(table.to_pylist()) == exact([expected_tick(tick) for tick in TICKS])
+    assert table["command_mw"].null_count == 0
+    ticks = table["tick_ns"].to_pylist()
+    assert all(b - a == PERIOD_NS for a, b in itertools.pairwise(ticks))
+
+
+def test_instance_rows(session: Path, tmp_path: Path) -> None:
+    export(session, tmp_path / "i.parquet", "instance")
+    expected = [
+        {
+            "tick_ns": tick.record.tick_ns,
+            "instance": name,
+            "state": str(instance.state),
+            "active": instance.active,
+            "delta_f_mhz": none_if_nan(instance.delta_f_mhz),
+            "command_mw": none_if_nan(instance.command_mw),
+            "reason": instance.reason or None,
+        }
+        for tick in TICKS
+        for name, instance in zip(INSTANCES, tick.record.instances, strict=True)
+    ]
+    assert exact(pq.read_table(tmp_path / "i.parquet").to_pylist()) == exact(expected)
+
+
+def test_pmu_rows(session: Path, tmp_path: Path) -> None:
+    export(session, tmp_path / "p.parquet", "pmu")
+    rows = pq.read_table(tmp_path / "p.parquet").to_pylist()
+    frames = [frame for tick in TICKS for frame in tick.frames]
+    plain = ["time_ns", "arrival_ns", "tick_ns", "pmu", "stamp_source", "stat", "time_quality"]
+    assert [[row[key] for key in plain] for row in rows] == [
+        [f.time_ns, f.arrival_ns, f.tick_ns, f.name, str(f.stamp_source), f.stat, f.time_quality] for f in frames
+    ]
+    for row, frame in zip(rows, frames, strict=True):
+        assert bits(row["freq_hz"]) == bits(none_if_nan(frame.frequency_hz))
+        assert bits(row["rocof_hz_s"]) == bits(none_if_nan(frame.rocof_hz_s))
+        if row["v1.mag"] is not None and row["v1.deg"] is not None and math.isfinite(row["v1.mag"]):
+            angle = math.radians(row["v1.deg"])
+            scale = max(abs(frame.v1), 1e-300)
+            assert row["v1.mag"] * math.cos(angle) == pytest.approx(frame.v1.real, abs=1e-12 * scale)
+            assert row["v1.mag"] * math.sin(angle) == pytest.approx(frame.v1.imag, abs=1e-12 * scale)
+
+
+def test_event_rows(session: Path, tmp_path: Path) -> None:
+    export(session, tmp_path / "e.parquet", "event")
+    expected = []
+    for tick in TICKS:
+        at = tick.record.tick_ns
+        expected += [(at, "order", order.name, None, None, none_if_nan(order.value)) for order in tick.orders]
+        expected += [(at, "event", e.name, e.subject, e.detail, None) for e in tick.record.events]
+    rows = pq.read_table(tmp_path / "e.parquet").to_pylist()
+    assert bits(tuple(tuple(row.values()) for row in rows)) == bits(tuple(expected))
+
+
+def test_gaps_are_counted(session: Path, tmp_path: Path) -> None:
+    data = bytearray(session.read_bytes())
+    at = data.index(b"\x04\x00\x00\x00zstd", len(data) // 4) + 500
+    data[at : at + 3] = b"rot"
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(bytes(data))
+    summary = export(damaged, tmp_path / "t.csv")
+    assert 85 <= summary.rows <= 95 and summary.gaps == 1 and summary.damage.records == 1
+
+
+def test_mistakes_are_one_line_and_write_nothing(session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "t.parquet"
+    with pytest.raises(SettingsError, match="no table 'ticks'; there are tick, instance, pmu, event"):
+        export(session, out, "ticks")
+    with pytest.raises(SettingsError, match=r"t\.xlsx: unknown suffix '\.xlsx'; use one of \.csv, "):
+        export(session, tmp_path / "t.xlsx")
+    with pytest.raises(SettingsError, match="unknown suffix"):
+        export(session, tmp_path / "t.parquet.gz")
+    with pytest.raises(SourceError, match="No such file"):
+        export(tmp_path / "none.mcap", out)
+    with pytest.raises(SourceError, match="holds no tick"):
+        export(write_session(tmp_path / "empty.mcap", []), out)
+    assert not out.exists()
+    for suffix in ("csv", "jsonl", "parquet", "arrow"):
+        with pytest.raises(SourceError, match=rf"t\.{suffix}: cannot write: No such file or directory"):
+            export(session, tmp_path / "nowhere" / f"t.{suffix}")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "csv.gz", "parquet", "arrow"])
+def test_a_full_disk_is_one_line(session: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"t.{suffix}"
+    out.symlink_to("/dev/full")
+    with pytest.raises(SourceError, match="cannot write: No space left on device"):
+        export(session, out)
