@@ -36,8 +36,8 @@ class ExportSummary(NamedTuple):
 def export(session: str | os.PathLike[str], out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
     """Write one table of a session log to ``out``: ``.csv .parquet .arrow .jsonl``, text also ``.gz`` or ``.zst``.
 
-    Raises SettingsError for a table or suffix that is not known, SourceError where either file cannot be used or the
-    log holds nothing for the table; ``out`` is then not written.
+    Raises SettingsError for a table or suffix that is not known, SourceError where either file cannot be used or (for
+    ``tick``) the log holds no tick: ``out`` is then not written.
     """
     if table not in TABLES:
         raise SettingsError(f"no table {table!r}; there are {', '.join(TABLES)}")
