@@ -12,128 +12,57 @@ Numbers in the objects are exact: ints as sent, floats computed in double precis
 
 from __future__ import annotations
 
-import binascii
-import cmath
 import math
 import random
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
-Object = dict[str, Any]
-"""One line of ``pmu dump --json``."""
+from support.meaning import Object, expected_command, expected_config, expected_data, expected_header
+from support.wire import (
+    ALL_FORMATS,
+    ANALOG_FLOAT,
+    CONFIG_KINDS,
+    FILLER,
+    FREQ_FLOAT,
+    NAN,
+    PHASOR_FLOAT,
+    POLAR,
+    AnalogSpec,
+    Block,
+    Name,
+    PhasorSpec,
+    Stamp,
+    StationSpec,
+    StreamSpec,
+    WordSpec,
+    command_frame,
+    config_frame,
+    data_frame,
+    header_frame,
+)
 
-SYNC = {"data": 0xAA01, "header": 0xAA11, "cfg1": 0xAA21, "cfg2": 0xAA31, "command": 0xAA41, "cfg3": 0xAA52}
-CONFIG_KINDS = ("cfg1", "cfg2", "cfg3")
-POLAR, PHASOR_FLOAT, ANALOG_FLOAT, FREQ_FLOAT = 1, 2, 4, 8
-ALL_FORMATS = range(16)
-COMMAND_NAMES = {
-    1: "stop_data",
-    2: "start_data",
-    3: "send_header",
-    4: "send_cfg1",
-    5: "send_cfg2",
-    6: "send_cfg3",
-    8: "extended",
-}
-FILLER = -0x8000
-NAN = float("nan")
-
-
-# --- descriptions -----------------------------------------------------------------------------------------------
-
-
-class Stamp(NamedTuple):
-    """Time fields of a frame; ``time_quality`` is the whole byte."""
-
-    soc: int = 0
-    time_quality: int = 0
-    fracsec: int = 0
-
-
-EPOCH = Stamp()
-
-
-class Name(NamedTuple):
-    """What CFG-1/2 (at most 16 bytes, ASCII) and what CFG-3 (at most 255 bytes, UTF-8) call one thing."""
-
-    short: str
-    long: str
-
-    def under(self, kind: str) -> str:
-        return self.long if kind == "cfg3" else self.short
-
-
-@dataclass(frozen=True, slots=True)
-class PhasorSpec:
-    name: Name
-    current: bool
-    phunit: int
-    """Lower 24 bits: 1e-5 V or A per count."""
-    flags: int = 0
-    component: int = 1
-    user: int = 0
-    scale: float = 1.0
-    angle_offset_rad: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class AnalogSpec:
-    name: Name
-    anunit: int = 0
-    multiplier: float = 1.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class WordSpec:
-    labels: tuple[Name, ...]
-    normal: int = 0
-    valid: int = 0xFFFF
-
-
-@dataclass(frozen=True, slots=True)
-class StationSpec:
-    name: Name
-    idcode: int
-    format: int
-    phasors: tuple[PhasorSpec, ...] = ()
-    analogs: tuple[AnalogSpec, ...] = ()
-    words: tuple[WordSpec, ...] = ()
-    fnom: int = 0
-    cfgcnt: int = 0
-    g_pmu_id: bytes = bytes(16)
-    place: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    service_class: str = "M"
-    window_us: int = 0
-    group_delay_us: int = 0
-
-    @property
-    def fnom_hz(self) -> int:
-        return 50 if self.fnom & 1 else 60
-
-
-@dataclass(frozen=True, slots=True)
-class StreamSpec:
-    idcode: int
-    stations: tuple[StationSpec, ...]
-    data_rate: int
-    time_base: int
-
-
-class Block(NamedTuple):
-    """One station's values in a data frame, in wire units."""
-
-    stat: int
-    phasors: tuple[tuple[float, float], ...]
-    freq: float
-    dfreq: float
-    analogs: tuple[float, ...]
-    digitals: tuple[int, ...]
+__all__ = [
+    "ALL_FORMATS",
+    "CONFIG_KINDS",
+    "Described",
+    "Object",
+    "Stamp",
+    "command_frame",
+    "config_frame",
+    "data_frame",
+    "expected_command",
+    "expected_config",
+    "expected_data",
+    "expected_header",
+    "header_frame",
+    "random_stream",
+    "streams",
+    "with_format",
+]
 
 
 @dataclass(frozen=True)
@@ -161,247 +90,6 @@ class Described:
         """Objects of the data frames when the configuration of ``kind`` is in force."""
         return tuple(expected_data(self.spec, kind, *frame) for frame in zip(self.stamps, self.blocks, strict=True))
 
-
-# --- bytes ------------------------------------------------------------------------------------------------------
-
-
-def frame(kind: str, idcode: int, stamp: Stamp, payload: bytes) -> bytes:
-    """A whole frame around ``payload``, with FRAMESIZE and CHK."""
-    head = struct.pack(">HHHI", SYNC[kind], 16 + len(payload), idcode, stamp.soc)
-    body = head + struct.pack(">I", stamp.time_quality << 24 | stamp.fracsec) + payload
-    return body + struct.pack(">H", binascii.crc_hqx(body, 0xFFFF))
-
-
-def command_frame(idcode: int, code: int, stamp: Stamp = EPOCH, extended: bytes = b"") -> bytes:
-    return frame("command", idcode, stamp, struct.pack(">H", code) + extended)
-
-
-def header_frame(idcode: int, text: str, stamp: Stamp = EPOCH) -> bytes:
-    return frame("header", idcode, stamp, text.encode("ascii"))
-
-
-def config_frame(spec: StreamSpec, kind: str, stamp: Stamp = EPOCH) -> bytes:
-    block = _station3 if kind == "cfg3" else _station2
-    parts = [b"\0\0"] if kind == "cfg3" else []
-    parts.append(struct.pack(">IH", spec.time_base, len(spec.stations)))
-    parts += [block(station) for station in spec.stations]
-    parts.append(struct.pack(">h", spec.data_rate))
-    return frame(kind, spec.idcode, stamp, b"".join(parts))
-
-
-def data_frame(spec: StreamSpec, stamp: Stamp, blocks: Sequence[Block]) -> bytes:
-    payload = b"".join(_block(*pair) for pair in zip(spec.stations, blocks, strict=True))
-    return frame("data", spec.idcode, stamp, payload)
-
-
-def _names(station: StationSpec) -> list[Name]:
-    channels = [channel.name for channel in (*station.phasors, *station.analogs)]
-    return channels + [label for word in station.words for label in word.labels]
-
-
-def _counts(station: StationSpec) -> bytes:
-    return struct.pack(">HHHH", station.format, len(station.phasors), len(station.analogs), len(station.words))
-
-
-def _masks(station: StationSpec) -> bytes:
-    return b"".join(struct.pack(">HH", word.normal, word.valid) for word in station.words)
-
-
-def _station2(station: StationSpec) -> bytes:
-    parts = [f"{station.name.short:16}".encode("ascii"), struct.pack(">H", station.idcode), _counts(station)]
-    parts += [f"{name.short:16}".encode("ascii") for name in _names(station)]
-    parts += [struct.pack(">I", phasor.current << 24 | phasor.phunit) for phasor in station.phasors]
-    parts += [struct.pack(">I", analog.anunit) for analog in station.analogs]
-    parts += [_masks(station), struct.pack(">HH", station.fnom, station.cfgcnt)]
-    return b"".join(parts)
-
-
-def _station3(station: StationSpec) -> bytes:
-    parts = [_name3(station.name), struct.pack(">H", station.idcode), station.g_pmu_id, _counts(station)]
-    parts += [_name3(name) for name in _names(station)]
-    for phasor in station.phasors:
-        kind = phasor.current << 3 | phasor.component
-        scales = (phasor.scale, phasor.angle_offset_rad)
-        parts.append(struct.pack(">HBBff", phasor.flags, kind, phasor.user, *scales))
-    parts += [struct.pack(">ff", analog.multiplier, analog.offset) for analog in station.analogs]
-    parts += [_masks(station), struct.pack(">fff", *station.place), station.service_class.encode("ascii")]
-    parts.append(struct.pack(">iiHH", station.window_us, station.group_delay_us, station.fnom, station.cfgcnt))
-    return b"".join(parts)
-
-
-def _name3(name: Name) -> bytes:
-    raw = name.long.encode("utf-8")
-    return bytes((len(raw),)) + raw
-
-
-def _block(station: StationSpec, block: Block) -> bytes:
-    phasor = "ff" if station.format & PHASOR_FLOAT else "Hh" if station.format & POLAR else "hh"
-    freq = "f" if station.format & FREQ_FLOAT else "h"
-    analog = "f" if station.format & ANALOG_FLOAT else "h"
-    parts = [struct.pack(">H", block.stat)]
-    parts += [struct.pack(">" + phasor, *pair) for pair in block.phasors]
-    parts.append(struct.pack(">" + freq * 2, block.freq, block.dfreq))
-    parts += [struct.pack(">" + analog, value) for value in block.analogs]
-    parts += [struct.pack(">H", word) for word in block.digitals]
-    return b"".join(parts)
-
-
-# --- expectations -----------------------------------------------------------------------------------------------
-
-
-def expected_prefix(kind: str, idcode: int, stamp: Stamp, time_base: int) -> Object:
-    """The keys every object has; ``leap`` is the leap bits (0x40 direction, 0x20 occurred, 0x10 pending)."""
-    time_ns = math.floor((stamp.soc + Fraction(stamp.fracsec, time_base)) * 10**9 + Fraction(1, 2))
-    seconds, rest_ns = divmod(time_ns, 10**9)
-    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=seconds)
-    return {
-        "type": kind,
-        "idcode": idcode,
-        "time_ns": time_ns,
-        "time": f"{moment:%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}Z",
-        "time_quality": stamp.time_quality,
-        "leap": stamp.time_quality & 0x70,
-        "chk_ok": True,
-        "version": SYNC[kind] & 0xF,
-        "soc": stamp.soc,
-        "fracsec": stamp.fracsec,
-    }
-
-
-def expected_command(idcode: int, code: int, stamp: Stamp, time_base: int, extended: bytes = b"") -> Object:
-    name = COMMAND_NAMES.get(code) or f"{'user' if 0x100 <= code <= 0xFFF else 'reserved'}-{code:#06x}"
-    fields = {"command": name, "code": code, "extended": extended.hex()}
-    return expected_prefix("command", idcode, stamp, time_base) | fields
-
-
-def expected_header(idcode: int, text: str, stamp: Stamp, time_base: int) -> Object:
-    return expected_prefix("header", idcode, stamp, time_base) | {"text": text}
-
-
-def expected_config(spec: StreamSpec, kind: str, stamp: Stamp) -> Object:
-    rate = Fraction(spec.data_rate) if spec.data_rate >= 0 else Fraction(-1, spec.data_rate)
-    return expected_prefix(kind, spec.idcode, stamp, spec.time_base) | {
-        "time_base": spec.time_base,
-        "data_rate": spec.data_rate,
-        "rate_hz": float(rate),
-        "stations": [_expected_station(station, kind) for station in spec.stations],
-    }
-
-
-def _expected_station(station: StationSpec, kind: str) -> Object:
-    expected: Object = {
-        "name": station.name.under(kind),
-        "idcode": station.idcode,
-        "format": station.format,
-        "fnom_hz": station.fnom_hz,
-        "cfgcnt": station.cfgcnt,
-        "phasors": [_expected_phasor_channel(phasor, kind) for phasor in station.phasors],
-        "analogs": [analog.name.under(kind) for analog in station.analogs],
-        "analog_scales": [_expected_analog_scale(analog, kind) for analog in station.analogs],
-        "digitals": [[label.under(kind) for label in word.labels] for word in station.words],
-        "digital_masks": [{"normal": word.normal, "valid": word.valid} for word in station.words],
-    }
-    if kind != "cfg3":
-        return expected
-    place = zip(("latitude_deg", "longitude_deg", "elevation_m"), station.place, strict=True)
-    return expected | {
-        "g_pmu_id": station.g_pmu_id.hex(),
-        **{key: _json(value) for key, value in place},
-        "service_class": station.service_class,
-        "window_us": station.window_us,
-        "group_delay_us": station.group_delay_us,
-    }
-
-
-def _expected_phasor_channel(phasor: PhasorSpec, kind: str) -> Object:
-    channel = {"name": phasor.name.under(kind), "kind": "I" if phasor.current else "V"}
-    if kind != "cfg3":
-        return channel | {"unit": phasor.phunit * 1e-5}
-    return channel | {
-        "unit": phasor.scale,
-        "flags": phasor.flags,
-        "component": phasor.component,
-        "angle_offset_rad": phasor.angle_offset_rad,
-    }
-
-
-def _expected_analog_scale(analog: AnalogSpec, kind: str) -> Object:
-    if kind == "cfg3":
-        return {"multiplier": analog.multiplier, "offset": analog.offset}
-    unit = analog.anunit & 0xFFFFFF
-    return {"kind": analog.anunit >> 24, "unit": unit - (1 << 24) if unit >> 23 else unit}
-
-
-def expected_data(spec: StreamSpec, kind: str, stamp: Stamp, blocks: Sequence[Block]) -> Object:
-    pairs = zip(spec.stations, blocks, strict=True)
-    stations = [_expected_block(station, kind, block) for station, block in pairs]
-    return expected_prefix("data", spec.idcode, stamp, spec.time_base) | {"stations": stations}
-
-
-def _expected_block(station: StationSpec, kind: str, block: Block) -> Object:
-    phasors = [
-        si_phasor(channel, station.format, kind, *pair)
-        for channel, pair in zip(station.phasors, block.phasors, strict=True)
-    ]
-    frequency = si_frequency(station, block.freq)
-    present = not math.isnan(frequency) or any(not cmath.isnan(phasor) for phasor in phasors)
-    return {
-        "name": station.name.under(kind),
-        "idcode": station.idcode,
-        "stat": block.stat,
-        "valid": present and block.stat < 0x4000,
-        "phasors": [
-            {
-                "name": channel.name.under(kind),
-                "kind": "I" if channel.current else "V",
-                "re": _json(phasor.real),
-                "im": _json(phasor.imag),
-            }
-            for channel, phasor in zip(station.phasors, phasors, strict=True)
-        ],
-        "frequency": _json(frequency),
-        "rocof": _json(si_rocof(station, block.dfreq)),
-        "analogs": [
-            _json(value * channel.multiplier + channel.offset if kind == "cfg3" else value)
-            for channel, value in zip(station.analogs, block.analogs, strict=True)
-        ],
-        "digitals": list(block.digitals),
-    }
-
-
-def si_phasor(channel: PhasorSpec, fmt: int, kind: str, first: float, second: float) -> complex:
-    """V or A of one wire phasor; NaN where it is the filler."""
-    floating, polar = fmt & PHASOR_FLOAT, fmt & POLAR
-    if math.isnan(first) or math.isnan(second):
-        return complex(NAN, NAN)
-    if not floating and second == FILLER and (polar or first == FILLER):
-        return complex(NAN, NAN)
-    if kind == "cfg3":
-        factor, turn = channel.scale, channel.angle_offset_rad
-    else:
-        factor, turn = 1.0 if floating else channel.phunit * 1e-5, 0.0
-    if polar:
-        return cmath.rect(factor * first, (second if floating else second * 1e-4) - turn)
-    return factor * complex(first, second) * cmath.exp(-1j * turn)
-
-
-def si_frequency(station: StationSpec, freq: float) -> float:
-    if station.format & FREQ_FLOAT:
-        return freq
-    return NAN if freq == FILLER else station.fnom_hz + freq / 1000
-
-
-def si_rocof(station: StationSpec, dfreq: float) -> float:
-    if station.format & FREQ_FLOAT:
-        return dfreq
-    return NAN if dfreq == FILLER else dfreq / 100
-
-
-def _json(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-# --- chance -----------------------------------------------------------------------------------------------------
 
 COMMON_TIME_BASES = (1, 1000, 1_000_000, 0xFFFFFF)
 COMMON_DATA_RATES = (1, 10, 25, 30, 50, 60, 100, 120, -1, -5, -60, 32767, -32767)
