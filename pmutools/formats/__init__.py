@@ -1,0 +1,1 @@
+"""Files that hold measurements: captures, raw frames, tables, logs."""

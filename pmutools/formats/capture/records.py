@@ -1,0 +1,100 @@
+"""From a sliding window to captured packets: what both file grammars share.
+
+A grammar runs over sound records at full speed, and is asked to judge only what stopped it: a record that reaches out
+of view, the end of the file, or damage. Every byte of the file is a packet's, overhead, skipped or cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools.formats.capture.tally import Tally
+from pmutools.formats.capture.window import BLOCK, Window
+
+Ints = npt.NDArray[np.int64]
+
+MAX_PACKET = 1 << 20
+"""A longer packet is taken for damage (libpcap's own limit is 262144; loopback with BIG TCP reaches 512 KiB)."""
+
+LOOK = 4 * MAX_PACKET
+"""Bytes that a judgement or the proof of a search result may look at."""
+
+NO_STAMP = -(1 << 63)
+"""In :attr:`Records.arrival_ns`: the file has no stamp for this packet."""
+
+_VIEW = LOOK + BLOCK
+
+
+class Records(NamedTuple):
+    """N captured packets, each ``data[start:stop]``."""
+
+    data: bytes
+    start: Ints
+    stop: Ints
+    wire_length: Ints
+    arrival_ns: Ints
+    linktype: Ints
+
+
+class Verdict(NamedTuple):
+    """On the record where a run stopped: it is good up to ``kept`` (where it starts, if it is none of ours), and
+    reading goes on at ``resume``. ``cut``: the bytes between are the file's cut tail. ``need``: look again with as
+    many bytes in view. ``record``: the packet, if there is one up to ``kept``."""
+
+    kept: int
+    resume: int
+    cut: bool = False
+    need: int = 0
+    record: Records | None = None
+
+
+class Grammar(Protocol):
+    """One file's record structure."""
+
+    def run(self, data: bytes) -> tuple[Records, int]:
+        """The packets of the sound records from the start of ``data``, and where the first other record starts."""
+
+    def judge(self, data: bytes, pos: int, ended: bool) -> Verdict:
+        """Decide on the record at ``pos``, with :data:`LOOK` bytes in view or the end of the file."""
+
+
+def read_records(window: Window, tally: Tally, grammar: Grammar) -> Iterator[Records]:
+    """The packets of the rest of a file, those of about a block of the file at a time."""
+    drop, need = 0, BLOCK
+    in_gap = False
+    while True:
+        window.advance(drop, need)
+        data = window.data
+        records, pos = grammar.run(data)
+        yield records
+        verdict = Verdict(pos, pos, need=BLOCK if pos else _VIEW)
+        if window.ended or len(data) - pos >= LOOK:
+            verdict = grammar.judge(data, pos, window.ended)
+            if verdict.record is not None:
+                yield verdict.record
+        captured = [part.stop - part.start for part in (records, verdict.record) if part is not None]
+        tally.overhead_bytes += verdict.kept - sum(int(each.sum()) for each in captured)
+        in_gap = in_gap and not verdict.kept
+        passed = verdict.resume - verdict.kept
+        if verdict.cut:
+            tally.cut_bytes += passed
+        elif passed:
+            tally.skipped_bytes += passed
+            tally.gaps += not in_gap
+            in_gap = True
+        drop, need = verdict.resume, max(verdict.need, BLOCK)
+        if window.ended and drop == len(data):
+            return
+
+
+def gather(data: bytes, positions: Ints, layout: np.dtype[Any]) -> npt.NDArray[Any]:
+    """The structures of ``layout`` that lie at ``positions`` of ``data``, aligned or not; shape (N,)."""
+    if not len(positions):
+        return np.empty(0, layout)
+    places = len(data) - layout.itemsize + 1
+    raw = np.ndarray((places,), np.dtype(("V", layout.itemsize)), data, 0, (1,))
+    return raw[positions].view(layout)
