@@ -1,0 +1,23 @@
+"""What goes into a plant and what comes out of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Drive(NamedTuple):
+    """Power in MW, constant over a step of the plant."""
+
+    modulation_mw: float = 0.0
+    """Added to the HVDC line's schedule; positive withdraws at the north end and injects at the south end."""
+    brake_mw: float = 0.0
+    """Load of the dynamic brake in the north."""
+
+
+class Bus(NamedTuple):
+    """Voltage at one bus: angle in the frame of nominal frequency (it turns, and is not wrapped), deviation, rate."""
+
+    angle_rad: float
+    deviation_hz: float
+    rocof_hz_s: float
+    voltage_pu: float = 1.0
