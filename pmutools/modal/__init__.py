@@ -1,0 +1,1 @@
+"""Modes from measurements: frequency and damping of a ringdown."""
