@@ -1,0 +1,111 @@
+"""The content stage: frames whose bytes are wrong. ``corrupt = 1% stat(not_synchronised) station=N1 when=5..8``.
+
+A fault of the wire (flipped bits, wrong CHK, FRAMESIZE or SYNC, cut short) leaves CHK as it was, so a receiver must
+find it; a fault of the source (IDCODE, STAT, time, values) gets the CHK that fits. ``chk=keep|fix`` says otherwise.
+Bytes change above UDP and TCP, whose own checksums stay right: the receiver's CHK is what is tested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+from pmutools.c37118.checksum import chk
+from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import CHK_SIZE, MIN_FRAME_SIZE, FrameType
+from pmutools.impair.blocks import chance
+from pmutools.impair.draws import Draws
+from pmutools.impair.moment import Moment
+from pmutools.impair.scope import FIELDS, STATION_FIELDS, WHOLE, Scope, Span, byte_span
+from pmutools.impair.selectors import DATA, Selector, Test, selector
+from pmutools.impair.source_faults import FalseValues, MovedStamp, Quality, RepeatedStamp, StatBits, WrongIdcode
+from pmutools.impair.wire_faults import Bits, Change, Truncate, WrongChk, WrongSize, WrongSync
+from pmutools.parsers import choice, one_of, parsed_by, probability
+
+
+class Kind(Protocol):
+    """A kind of content fault. ``refit``: CHK is made to fit afterwards."""
+
+    @property
+    def refit(self) -> bool: ...
+
+    def change(self, draws: Draws, scope: Scope) -> Change:
+        """The fault on one stream; draw 0 is the stage's, a fault's own begin at 1. Raises ValueError."""
+
+
+KINDS: dict[str, type[Kind]] = {
+    "bits": Bits,
+    "chk": WrongChk,
+    "sync": WrongSync,
+    "framesize": WrongSize,
+    "truncate": Truncate,
+    "idcode": WrongIdcode,
+    "stat": StatBits,
+    "quality": Quality,
+    "stamp": MovedStamp,
+    "repeat": RepeatedStamp,
+    "value": FalseValues,
+}
+_kind = one_of(KINDS, "content fault")
+
+
+class Fault(NamedTuple):
+    p: float
+    kind: Kind
+
+
+def fault(text: str) -> Fault:
+    """``[P%] [KIND(...)]``: one bit where no kind is given, every frame where no probability is."""
+    head, _, rest = text.partition(" ")
+    if head[:1] in "0123456789.":
+        return Fault(probability(head), _kind(rest) if rest.strip() else Bits())
+    return Fault(1.0, _kind(text))
+
+
+@dataclass(frozen=True, slots=True)
+class Corrupt:
+    fault: Fault = field(metadata=parsed_by(fault))
+    field_: str = field(default="", metadata=parsed_by(choice(*FIELDS)))
+    station: str = field(default="", metadata=parsed_by(str))
+    bytes_: Span = field(default=WHOLE, metadata=parsed_by(byte_span))
+    chk_: str = field(default="", metadata=parsed_by(choice("keep", "fix")))
+    when: Selector = field(default=DATA, metadata=parsed_by(selector))
+
+    def __post_init__(self) -> None:
+        if self.field_ and self.bytes_ != WHOLE:
+            raise ValueError("field= and bytes= both say where; give one")
+
+    @property
+    def refit(self) -> bool:
+        return self.fault.kind.refit if not self.chk_ else self.chk_ == "fix"
+
+
+class Corruption:
+    """One content fault at work on one stream."""
+
+    def __init__(self, part: Corrupt, draws: Draws, selected: Test, config: StreamConfig | None) -> None:
+        kind = part.fault.kind
+        by_layout = part.field_ in STATION_FIELDS or isinstance(kind, StatBits | FalseValues)
+        self._size = config.frame_size if config is not None and by_layout else 0
+        self._change = kind.change(draws, Scope(config, part.field_, part.station, part.bytes_))
+        self._refit = part.refit
+        self._happens = chance(draws, part.fault.p)
+        self._selected = selected
+        self._last = b""
+
+    def apply(self, frame: bytes, at: Moment) -> tuple[bytes, str]:
+        """The frame, changed or not, and what was done ("" for nothing).
+
+        Left alone besides: frames cut short before, and for a fault placed by the configuration, frames that are not
+        data or not of its size.
+        """
+        fits = (at.type is FrameType.DATA and len(frame) == self._size) if self._size else len(frame) >= MIN_FRAME_SIZE
+        if not (fits and self._happens(at) and self._selected(at)):
+            if fits and at.type is FrameType.DATA:
+                self._last = frame
+            return frame, ""
+        changed = bytearray(frame)
+        done = self._change(changed, at, self._last)
+        if done and self._refit:
+            changed[-CHK_SIZE:] = chk(bytes(changed[:-CHK_SIZE])).to_bytes(CHK_SIZE, "big")
+        return bytes(changed), f"corrupt:{done}" if done else ""

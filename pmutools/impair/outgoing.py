@@ -1,0 +1,94 @@
+"""What the pipeline makes of a frame, and the ledger's row about it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class Fate(StrEnum):
+    """What became of a copy of a frame."""
+
+    SENT = "sent"
+    LOST = "lost"
+    """By a loss model, or by a full queue of the rate stage."""
+    DROPPED = "dropped"
+    """By ``drop``."""
+    DISABLED = "disabled"
+    SKIPPED = "skipped"
+    """Due, but passed over by the player (a seek, a late policy, no client)."""
+    FAILED = "failed"
+    """The operating system refused it."""
+
+
+class Outgoing(NamedTuple):
+    """One copy of a frame after the pipeline. ``offset_ns`` counts from the start of play, all delays included.
+
+    ``copy`` is 0 for the frame itself, 1, 2... for duplicates; ``delay_ns`` is what the delay stage added.
+    """
+
+    index: int  # type: ignore[assignment]  # not tuple.index
+    copy: int
+    data: bytes
+    offset_ns: int
+    fate: Fate = Fate.SENT
+    delay_ns: int = 0
+    marks: tuple[str, ...] = ()
+
+    @property
+    def faults(self) -> str:
+        """The ledger's comma list, e.g. ``delay:12.3ms,corrupt:1bit``."""
+        delay = (f"delay:{self.delay_ns / 1e6:.6g}ms",) if self.delay_ns else ()
+        return ",".join(delay + self.marks)
+
+
+class LedgerRow(NamedTuple):
+    """One copy of one frame, as planned and as done; times in ns of POSIX UTC, None where it never happened."""
+
+    stream: str
+    index: int  # type: ignore[assignment]  # not tuple.index
+    copy: int
+    source_time_ns: int
+    """Stamp as recorded."""
+    time_ns: int
+    """Stamp as sent."""
+    offset_ns: int
+    """When it was to leave, from the start of play."""
+    scheduled_ns: int
+    sent_ns: int | None
+    tx_stamp_ns: int | None
+    fate: str
+    faults: str
+    nbytes: int
+
+
+UNREPEATABLE = frozenset(("time_ns", "scheduled_ns", "sent_ns", "tx_stamp_ns"))
+"""The columns that depend on when a run took place; one source, profile and seed repeat all others."""
+
+
+def ledger_row(
+    stream: str,
+    outgoing: Outgoing,
+    *,
+    source_time_ns: int,
+    time_ns: int,
+    scheduled_ns: int,
+    sent_ns: int | None = None,
+    tx_stamp_ns: int | None = None,
+    fate: Fate | None = None,
+) -> LedgerRow:
+    """The row of a copy; ``fate`` is what became of it after the pipeline, where that differs."""
+    return LedgerRow(
+        stream,
+        outgoing.index,
+        outgoing.copy,
+        source_time_ns,
+        time_ns,
+        outgoing.offset_ns,
+        scheduled_ns,
+        sent_ns,
+        tx_stamp_ns,
+        str(fate or outgoing.fate),
+        outgoing.faults,
+        len(outgoing.data),
+    )

@@ -1,0 +1,202 @@
+"""Impairment profiles: who suffers what, and when that changes. One grammar for files, options and live control.
+
+::
+
+    [run]
+    seed = 7
+    [stream N*, 101]          ; patterns of stream names or IDCODEs; sections apply in order
+    delay = normal(16, 2) corr=30%
+    corrupt = 1% field=stat when=every 7
+              stat(do_not_use) when=5..8
+    loss = trace(@lost.txt)   ; numbers from a file beside the profile
+    [at 12.5]                 ; seconds of stream time
+    do = disable N1
+         fault N2 loss=gemodel(1%, 20%)
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from pmutools.errors import SourceError
+from pmutools.impair.stages import OPTIONS, Setting, Stages, parse_setting
+from pmutools.parsers import integer, parsed_by, seconds_ns, suggestion
+from pmutools.settings import Entry, Section, Where, fill, parse_ini
+
+ReadText = Callable[[str], str]
+
+
+class StreamRule(NamedTuple):
+    """One ``[stream PATTERN, ...]`` section, or one option."""
+
+    patterns: tuple[str, ...]
+    settings: tuple[tuple[str, Setting], ...]
+
+    def matches(self, names: Iterable[str]) -> bool:
+        return any(fnmatchcase(name.casefold(), pattern.casefold()) for name in names for pattern in self.patterns)
+
+
+class Action(NamedTuple):
+    """Something to do: ``enable``, ``disable`` and ``fault`` concern streams, all others the player."""
+
+    verb: str
+    rule: StreamRule | None = None
+    """Whom it concerns, and for ``fault`` what is set."""
+    argument: str = ""
+    at_ns: int = 0
+
+
+STREAM_VERBS = ("enable", "disable", "fault")
+PLAYER_VERBS = ("pause", "resume", "step", "seek", "speed", "loop", "stats")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    seed: int | None = field(default=None, metadata=parsed_by(integer(0, 2**64 - 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Rules in order, later ones over earlier ones, and a timeline in order of stream time."""
+
+    rules: tuple[StreamRule, ...] = ()
+    timeline: tuple[Action, ...] = ()
+    seed: int | None = None
+
+    def stages(self, names: Iterable[str]) -> Stages:
+        """What a stream known by these names goes through before the timeline changes it."""
+        names, stages = tuple(names), Stages()
+        for rule in self.rules:
+            if rule.matches(names):
+                for option, setting in rule.settings:
+                    stages = stages.changed(option, setting)
+        return stages
+
+    def then(self, other: Profile) -> Profile:
+        """This profile with ``other`` (say, the command line's options) on top."""
+        timeline = sorted((*self.timeline, *other.timeline), key=lambda action: action.at_ns)
+        seed = self.seed if other.seed is None else other.seed
+        return Profile(self.rules + other.rules, tuple(timeline), seed)
+
+    def unmatched(self, streams: Iterable[Iterable[str]]) -> tuple[str, ...]:
+        """Patterns of the rules that fit none of the streams (each given by its names): most likely misspelt."""
+        known = [tuple(names) for names in streams]
+        rules = [rule for rule in self.rules if not any(rule.matches(names) for names in known)]
+        return tuple(", ".join(rule.patterns) for rule in rules)
+
+
+def parse_profile(text: str, source: str, read: ReadText | None = None) -> Profile:
+    """A profile from INI text; ``read`` gives the text of a file that ``@NAME`` names. Raises SettingsError."""
+    ini = parse_ini(text, source)
+    ini.only("run", "stream *", "at *")
+    rules = tuple(_rule(section, read) for section in ini.family("stream"))
+    timeline = [action for section in ini.family("at") for action in _actions(section, read)]
+    timeline.sort(key=lambda action: action.at_ns)
+    return Profile(rules, tuple(timeline), fill(Run, ini.section("run")).seed)
+
+
+def read_profile_file(path: Path) -> Profile:
+    """A profile from a file; raises SettingsError, and SourceError for a file that cannot be read."""
+    return parse_profile(_text_of(path), str(path), lambda name: _text_of(path.parent / name))
+
+
+def profile_of_options(options: Iterable[tuple[str, str]], read: ReadText | None = None) -> Profile:
+    """A profile from (option, value) pairs of a command line; ``PATTERN@VALUE`` is for some streams only.
+
+    An option given again for the same streams adds to the first. Raises SettingsError naming ``--option``.
+    """
+    rules, seen = list[StreamRule](), set[tuple[str, str]]()
+    for option, text in options:
+        where = Where(f"--{option}")
+        pattern, value = _addressed(text)
+        if (pattern, option) in seen and not value.startswith("+"):
+            value = f"+{value}"
+        seen.add((pattern, option))
+        rules.append(StreamRule(_patterns(pattern), (_setting(option, Entry(value, where), read),)))
+    return Profile(tuple(rules))
+
+
+def parse_action(text: str, read: ReadText | None = None) -> Action:
+    """``enable NAME``, ``disable NAME``, ``fault NAME OPTION=VALUE`` or one of the player's verbs.
+
+    A NAME is a pattern, in double quotes where it holds a space before an option. Raises ValueError.
+    """
+    verb, _, rest = text.strip().partition(" ")
+    verb, rest = verb.lower(), rest.strip()
+    if verb in ("enable", "disable"):
+        if not rest:
+            raise ValueError(f"{verb} whom? write '{verb} NAME'")
+        return Action(verb, StreamRule(_patterns(rest.strip('"')), ()))
+    if verb == "fault":
+        match = _FAULT.fullmatch(rest)
+        if match is None:
+            raise ValueError(f"{text!r} is not of the form 'fault NAME OPTION=VALUE'")
+        setting = _setting(match[3].lower(), Entry(match[4], Where("fault", key=match[3].lower())), read)
+        return Action(verb, StreamRule(_patterns(match[1] or match[2]), (setting,)))
+    if verb in PLAYER_VERBS:
+        return Action(verb, argument=rest)
+    raise ValueError(f"{verb!r} is nothing to do; {suggestion(verb, (*STREAM_VERBS, *PLAYER_VERBS))}")
+
+
+_ADDRESSED = re.compile(r"([^@()]+?)@(.+)", re.DOTALL)
+_FAULT = re.compile(r'(?:"([^"]+)"|(\S+))\s+([A-Za-z]+)\s*=\s*(.*)', re.DOTALL)
+_FILE = re.compile(r"(?<=[(,\s])@([^\s,()]+)")
+
+
+def _addressed(text: str) -> tuple[str, str]:
+    match = _ADDRESSED.fullmatch(text.strip())
+    return (match[1], match[2]) if match else ("*", text)
+
+
+def _patterns(text: str) -> tuple[str, ...]:
+    return tuple(pattern.strip() for pattern in text.split(",") if pattern.strip())
+
+
+def _rule(section: Section, read: ReadText | None) -> StreamRule:
+    settings = tuple(_setting(option, entry, read) for option, entry in section.entries.items())
+    return StreamRule(_patterns(section.argument), settings)
+
+
+def _setting(option: str, entry: Entry, read: ReadText | None) -> tuple[str, Setting]:
+    if option not in OPTIONS:
+        raise entry.where.error(f"no such fault; {suggestion(option, OPTIONS)}")
+    return option, entry.read(lambda text: parse_setting(option, _with_files(text, read)))
+
+
+def _with_files(text: str, read: ReadText | None) -> str:
+    """``@NAME`` replaced by the numbers in that file, which spaces, commas or line ends part; ``#`` comments."""
+
+    def numbers(match: re.Match[str]) -> str:
+        if read is None:
+            raise ValueError(f"@{match[1]}: no file can be named here")
+        lines = (line.partition("#")[0] for line in read(match[1]).splitlines())
+        return ",".join(number for line in lines for number in line.replace(",", " ").split())
+
+    return _FILE.sub(numbers, text)
+
+
+def _actions(section: Section, read: ReadText | None) -> Iterator[Action]:
+    try:
+        at_ns = seconds_ns(section.argument)
+    except ValueError as error:
+        raise section.where.error(f"{error}; write [at SECONDS]") from None
+    if not section.entries:
+        raise section.where.error("nothing to do; add a line 'do = disable NAME'")
+    for key, entry in section.entries.items():
+        if key != "do":
+            raise entry.where.error(f"unknown key; {suggestion(key, ('do',))}")
+        for line in entry.text.split("\n"):
+            if line.strip():
+                yield entry._replace(text=line).read(lambda text: parse_action(text, read))._replace(at_ns=at_ns)
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None

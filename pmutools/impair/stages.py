@@ -1,0 +1,82 @@
+"""The options of a stream: which stages there are, how each is written, how later settings meet earlier ones.
+
+One line of a value is one part of a stage. ``delay`` parts add up, ``corrupt`` parts follow each other, a frame is
+lost, dropped or disabled if any part says so; the other stages have one part. A value replaces what was set before,
+``none`` switches it off, a value that begins with ``+`` adds its parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+from pmutools.impair.content import Corrupt
+from pmutools.impair.delays import Delay
+from pmutools.impair.gate import Disable
+from pmutools.impair.grammar import parse_stage
+from pmutools.impair.link import Rate, Slot
+from pmutools.impair.losses import Loss
+from pmutools.impair.reorder import Duplicate, Reorder
+from pmutools.impair.selectors import Selector, selector
+from pmutools.parsers import parsed_by
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    when: Selector = field(metadata=parsed_by(selector))
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """What one stream goes through, in this order."""
+
+    corrupt: tuple[Corrupt, ...] = ()
+    disable: tuple[Disable, ...] = ()
+    drop: tuple[Drop, ...] = ()
+    loss: tuple[Loss, ...] = ()
+    duplicate: tuple[Duplicate, ...] = ()
+    delay: tuple[Delay, ...] = ()
+    reorder: tuple[Reorder, ...] = ()
+    rate: tuple[Rate, ...] = ()
+    slot: tuple[Slot, ...] = ()
+
+    def changed(self, option: str, setting: Setting) -> Stages:
+        """With one option set (or added to)."""
+        parts = (*getattr(self, option), *setting.parts) if setting.adds else setting.parts
+        return replace(self, **{option: parts})
+
+
+class Setting(NamedTuple):
+    """The parts that a value gives an option, and whether they join those there already."""
+
+    parts: tuple[Any, ...]
+    adds: bool = False
+
+
+OPTIONS: dict[str, type[Any]] = {
+    "corrupt": Corrupt,
+    "disable": Disable,
+    "drop": Drop,
+    "loss": Loss,
+    "duplicate": Duplicate,
+    "delay": Delay,
+    "reorder": Reorder,
+    "rate": Rate,
+    "slot": Slot,
+}
+SEVERAL = frozenset(("corrupt", "disable", "drop", "loss", "delay"))
+"""Options that may have more than one part."""
+
+
+def parse_setting(option: str, text: str) -> Setting:
+    """The value of ``option`` (a key of :data:`OPTIONS`); raises ValueError."""
+    text = text.strip()
+    if text.lower() == "none":
+        return Setting(())
+    adds = text.startswith("+")
+    lines = [line for line in text.removeprefix("+").split("\n") if line.strip()]
+    if not lines:
+        raise ValueError("no value; write 'none' to switch the stage off")
+    if option not in SEVERAL and (adds or len(lines) > 1):
+        raise ValueError("only one of these a stream; give it once, without '+'")
+    return Setting(tuple(parse_stage(OPTIONS[option], line) for line in lines), adds)

@@ -1,0 +1,146 @@
+"""From the gate to the wire: drop and loss, duplicates, delay, reordering, rate and slots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from pmutools.impair.blocks import chance
+from pmutools.impair.delays import Delay, DelaySource
+from pmutools.impair.draws import Draws
+from pmutools.impair.grammar import named_parts
+from pmutools.impair.link import Rate, RateLink, Slot, SlotLink
+from pmutools.impair.losses import Loss, Lost
+from pmutools.impair.moment import Moment
+from pmutools.impair.outgoing import Fate, Outgoing
+from pmutools.impair.reorder import Duplicate, Leaving, Reorder, Reordering
+from pmutools.impair.selectors import Selector, Test, is_data
+from pmutools.impair.stages import Drop, Stages
+
+
+class Transmission:
+    """The stages of one stream that decide whether, when, how often and in which order frames leave.
+
+    ``draws`` gives the draws of a stage by its name.
+    """
+
+    def __init__(self, draws: Callable[[str], Draws]) -> None:
+        self._draws = draws
+        self._drops: list[Test] = []
+        self._losses: list[tuple[Lost, Test]] = []
+        self._copies: tuple[Callable[[Moment], int], Test, int] | None = None
+        self._delays: list[tuple[DelaySource, Test]] = []
+        self._keep_order = False
+        self._last_ns = 0
+        self._reordering: Reordering | None = None
+        self._rate: RateLink | None = None
+        self._slot: SlotLink | None = None
+        self._setters: dict[str, Callable[[Any], None]] = {
+            "drop": self._set_drop,
+            "loss": self._set_loss,
+            "duplicate": self._set_duplicate,
+            "delay": self._set_delay,
+            "reorder": self._set_reorder,
+            "rate": self._set_rate,
+            "slot": self._set_slot,
+        }
+
+    def change(self, option: str, stages: Stages) -> tuple[Outgoing, ...]:
+        """Put one option anew to work; gives what its old state held back."""
+        flushed = self.flush() if option == "reorder" else ()
+        self._setters[option](getattr(stages, option))
+        return flushed
+
+    def _set_drop(self, parts: tuple[Drop, ...]) -> None:
+        self._drops = [self._test(part.when, name) for name, part in named_parts("drop", parts)]
+
+    def _set_loss(self, parts: tuple[Loss, ...]) -> None:
+        self._losses = [
+            (part.model.lost(self._draws(name)), self._test(part.when, name))
+            for name, part in named_parts("loss", parts)
+        ]
+
+    def _set_duplicate(self, parts: tuple[Duplicate, ...]) -> None:
+        self._copies = None
+        for part in parts:
+            self._copies = chance(self._draws("duplicate"), part.p), self._test(part.when, "duplicate"), part.count
+
+    def _set_delay(self, parts: tuple[Delay, ...]) -> None:
+        self._keep_order = any(part.order == "keep" for part in parts)
+        self._delays = [
+            (part.source(self._draws(name)), self._test(part.when, name)) for name, part in named_parts("delay", parts)
+        ]
+
+    def _set_reorder(self, parts: tuple[Reorder, ...]) -> None:
+        self._reordering = None
+        for part in parts:
+            self._reordering = Reordering(part, self._draws("reorder"), self._test(part.when, "reorder"))
+
+    def _set_rate(self, parts: tuple[Rate, ...]) -> None:
+        self._rate = None
+        for part in parts:
+            self._rate = RateLink(part, self._test(part.when, "rate"))
+
+    def _set_slot(self, parts: tuple[Slot, ...]) -> None:
+        self._slot = None
+        for part in parts:
+            self._slot = SlotLink(part, self._draws("slot"), self._test(part.when, "slot"))
+
+    def send(
+        self, number: int, at: Moment, data: bytes, offset_ns: int, marks: tuple[str, ...]
+    ) -> tuple[Outgoing, ...]:
+        """The rows of a frame that passed the gate, due at ``offset_ns``; ``number`` is the caller's index."""
+        for drops in self._drops:
+            if drops(at):
+                return (Outgoing(number, 0, data, offset_ns, Fate.DROPPED, 0, marks),)
+        for lost, selected in self._losses:
+            if lost(at) and selected(at):
+                return (Outgoing(number, 0, data, offset_ns, Fate.LOST, 0, marks),)
+        extra = 0
+        if self._copies is not None:
+            happens, selected, count = self._copies
+            extra = count if happens(at) and selected(at) else 0
+        rows: tuple[Outgoing, ...] = ()
+        for copy in range(1 + extra):
+            then = at._replace(lane=at.lane + copy) if copy else at
+            delay_ns = 0
+            for source, selected in self._delays:
+                if selected(then):
+                    delay_ns += source(then)
+            leaves_ns = offset_ns + max(0, delay_ns)
+            if self._keep_order:
+                leaves_ns = self._last_ns = max(leaves_ns, self._last_ns)
+            row = Outgoing(number, copy, data, leaves_ns, Fate.SENT, leaves_ns - offset_ns, marks)
+            rows += self._leave(Leaving(row, then)) if self._reordering or self._rate or self._slot else (row,)
+        return rows
+
+    def delay_by_index(self) -> Callable[[int], int] | None:
+        """The delay (ns) of a data frame by its index, where nothing else happens to it and nothing else counts."""
+        others = self._drops or self._losses or self._copies or self._reordering or self._rate or self._slot
+        if others or self._keep_order or len(self._delays) > 1:
+            return None
+        if not self._delays:
+            return _no_delay
+        source, selected = self._delays[0]
+        return source.indexed if selected is is_data else None
+
+    def flush(self) -> tuple[Outgoing, ...]:
+        """What reordering still holds back."""
+        return self._link(self._reordering.close()) if self._reordering else ()
+
+    def _leave(self, leaving: Leaving) -> tuple[Outgoing, ...]:
+        return self._link(self._reordering.apply(leaving) if self._reordering else (leaving,))
+
+    def _link(self, leaving: Iterable[Leaving]) -> tuple[Outgoing, ...]:
+        rows = list[Outgoing]()
+        for outgoing, at in leaving:
+            row = self._rate.apply(outgoing, at) if self._rate else outgoing
+            rows.append(self._slot.apply(row, at) if self._slot and row.fate is Fate.SENT else row)
+        return tuple(rows)
+
+    def _test(self, selector: Selector, stage: str) -> Test:
+        return selector.test(self._draws(f"{stage}.when"))
+
+
+def _no_delay(index: int) -> int:
+    return 0
