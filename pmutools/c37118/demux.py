@@ -144,6 +144,11 @@ class Demux:
             for state in self._flows.values()
         )
 
+    def held(self, flow: Flow) -> dict[int, int]:
+        """Bytes of ``flow``'s data frames that wait for a fitting configuration, by IDCODE."""
+        state = self._flows.get(flow)
+        return {idcode: held.nbytes for idcode, held in state.held.items() if held.nbytes} if state else {}
+
     def _end(self, state: _FlowState, out: list[Message | Loss]) -> None:
         for item in state.framer.close():
             self._take(state, item, out)

@@ -44,7 +44,7 @@ class ClientEvent(StrEnum):
     EXHAUSTED = "exhausted"
     """As many time-outs in a row as :attr:`Timing.tries`."""
     STOP = "stop"
-    """The user has had enough."""
+    """The user has had enough; the owner closes the transport."""
 
 
 class ClientAction(StrEnum):
@@ -67,7 +67,7 @@ ClientTable = Mapping[tuple[ClientState, ClientEvent], Step]
 _S, _E, _A = ClientState, ClientEvent, ClientAction
 
 _ENDS = {(state, _E.CLOSED): Step(_S.IDLE) for state in ClientState if state is not _S.IDLE} | {
-    (state, _E.STOP): Step(_S.IDLE, (_A.SEND_STOP, _A.DISCONNECT)) for state in ClientState if state is not _S.IDLE
+    (state, _E.STOP): Step(_S.IDLE, (_A.SEND_STOP,)) for state in ClientState if state is not _S.IDLE
 }
 
 CFG2_FIRST: ClientTable = _ENDS | {
