@@ -1,0 +1,207 @@
+"""The command channel of one endpoint, over TCP or UDP: connect, converse, come back after a failure."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from typing import NamedTuple
+
+from pmutools.c37118.demux import Message
+from pmutools.c37118.session import (
+    ClientAction,
+    ClientEvent,
+    ClientRole,
+    ClientState,
+    ClientTable,
+    Timing,
+    backoff_ns,
+    command_for,
+)
+from pmutools.errors import SettingsError, SourceError
+from pmutools.flow import Chunk, Flow
+from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind
+from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.net.reactor import READ, WRITE, Reactor, Timer
+from pmutools.net.sockets import Address, explain, resolve
+from pmutools.net.tcp import TcpClient
+from pmutools.net.udp import Batches, UdpSocket
+
+CONNECT_NS = 5_000_000_000
+UNKNOWN_IDCODE = 1
+"""Asked for where the user names no IDCODE, until a frame shows the right one."""
+
+
+class Plumbing(NamedTuple):
+    """What all links of one front end share. ``emit`` takes what :meth:`Receivers.poll` gives out."""
+
+    reactor: Reactor
+    emit: Callable[[Chunk | LinkEvent], None]
+    batches: Batches | None
+    native: bool
+    links: dict[Flow, CommandLink]
+    """By the flows that the links have opened; :class:`Receivers` takes them out."""
+
+
+class CommandLink:
+    """One commanded endpoint, from the client's side.
+
+    ``owners`` are the places of this endpoint in the user's list, ``table`` and ``timing`` those of the role. Raises
+    SourceError for an unknown host; a server that cannot be reached now is news, and tried again later.
+    """
+
+    def __init__(
+        self, endpoint: Endpoint, owners: tuple[int, ...], table: ClientTable, timing: Timing, plumbing: Plumbing
+    ) -> None:
+        self.endpoint = endpoint
+        self.owners = owners
+        self.idcode = endpoint.idcode
+        self.flow: Flow | None = None
+        self.plumbing = plumbing
+        self.dialogue = Dialogue(ClientRole(table, timing), plumbing.reactor, self._tell, self._act)
+        self._over_tcp = endpoint.scheme is not Scheme.UDP_COMMANDED
+        self.address = resolve(endpoint.host, endpoint.port, datagram=not self._over_tcp)
+        self._local = _local(endpoint.iface, self._over_tcp)
+        self._transport: TcpClient | UdpSocket | None = None
+        self._connections = 0
+        self._failures = 0
+        self._timer: Timer | None = None
+        self._open()
+
+    def learn(self, idcode: int) -> None:
+        """Frames of ``idcode`` come on this link: if the user named none, it is the one to ask for."""
+        if self.idcode is not None:
+            return
+        self.idcode = idcode
+        state = self.dialogue.role.state
+        if state in _REQUEST_IN:
+            self._act(_REQUEST_IN[state], state)
+
+    def heard(self, message: Message, now_ns: int) -> None:
+        """A message of this endpoint's stream came, over whichever channel; ``now_ns`` is monotonic."""
+        self.dialogue.hear(message, now_ns)
+        if self.dialogue.role.state is ClientState.STREAMING:
+            self._failures = 0
+
+    def close(self) -> None:
+        """Stop the data, unless they go to a group that others may be listening to, and hang up."""
+        self.dialogue.step(ClientEvent.CLOSED if self.endpoint.is_multicast else ClientEvent.STOP)
+        self.dialogue.close()
+        self._hang_up()
+
+    def _open(self) -> None:
+        reactor = self.plumbing.reactor
+        try:
+            if not self._over_tcp:
+                wildcard = "::" if self.address.family == socket.AF_INET6 else "0.0.0.0"
+                udp = UdpSocket(
+                    self._local.host if self._local else wildcard,
+                    0,
+                    batches=self.plumbing.batches,
+                    native=self.plumbing.native,
+                )
+                self._transport = udp
+                udp.connect(self.address)
+                reactor.watch(udp, READ, lambda _: self._read_udp(udp))
+                self._opened(Flow("udp", str(self.address), str(udp.address)))
+                return
+            tcp = TcpClient(self.address, local=self._local, connection=self._connections, native=self.plumbing.native)
+        except SourceError as error:
+            self._fail(LinkKind.FAILED, str(error))
+            return
+        self._transport = tcp
+        self._timer = reactor.call_in(CONNECT_NS, self._too_late)
+        reactor.watch(tcp, WRITE, lambda _: self._connected(tcp))
+
+    def _too_late(self) -> None:
+        self._fail(LinkKind.FAILED, f"{self.endpoint}: no connection within {CONNECT_NS // 10**9} s; is the device on?")
+
+    def _connected(self, tcp: TcpClient) -> None:
+        try:
+            tcp.finish()
+        except OSError as error:
+            self._fail(LinkKind.FAILED, str(explain(error, self.endpoint)))
+            return
+        if self._timer is not None:
+            self._timer.cancelled = True
+        self._connections += 1
+        self.plumbing.reactor.watch(tcp, READ, lambda _: self._read_tcp(tcp))
+        self._opened(tcp.flow)
+
+    def _opened(self, flow: Flow) -> None:
+        self.flow = flow
+        self.plumbing.links[flow] = self
+        self._tell(LinkKind.CONNECTED, f"from {flow.destination}")
+        self.dialogue.step(ClientEvent.OPENED)
+
+    def _read_tcp(self, tcp: TcpClient) -> None:
+        try:
+            chunk = tcp.read()
+        except OSError as error:
+            self._fail(LinkKind.LOST, str(explain(error, self.endpoint)))
+            return
+        if chunk is not None:
+            self.plumbing.emit(chunk)
+
+    def _read_udp(self, udp: UdpSocket) -> None:
+        try:
+            chunks = udp.read()
+        except OSError as error:  # the answer to what we sent: nobody is there
+            self._fail(LinkKind.FAILED, str(explain(error, self.endpoint)))
+            return
+        for chunk in chunks:
+            self.plumbing.emit(chunk)
+
+    def _act(self, action: ClientAction, before: ClientState) -> None:
+        if action is ClientAction.DISCONNECT:
+            self._fail(LinkKind.UNANSWERED, self._silence(before))
+            return
+        clock = self.plumbing.reactor.clock
+        frame = command_for(action, self.idcode or UNKNOWN_IDCODE, clock.realtime_ns())
+        if frame is None or self._transport is None:
+            return
+        # A send that fails needs no care of its own: reading tells of a dead connection, a time-out of a lost datagram.
+        if isinstance(self._transport, TcpClient):
+            self._transport.send(frame)
+        else:
+            self._transport.send_connected(frame)
+
+    def _silence(self, before: ClientState) -> str:
+        if before is ClientState.WAIT_DATA:
+            return f"{self.endpoint}: no data came after the start command"
+        asked = f"IDCODE {self.idcode}" if self.idcode else f"IDCODE {UNKNOWN_IDCODE} (none was given)"
+        return f"{self.endpoint}: no configuration came; a device answers its own IDCODE only, {asked} was asked for"
+
+    def _fail(self, kind: LinkKind, detail: str) -> None:
+        """Tell, hang up, and try again later."""
+        self._tell(kind, detail)
+        self._hang_up()
+        self.dialogue.step(ClientEvent.CLOSED)
+        self._timer = self.plumbing.reactor.call_in(backoff_ns(self._failures), self._open)
+        self._failures += 1
+
+    def _hang_up(self) -> None:
+        if self._timer is not None:
+            self._timer.cancelled = True
+        if self._transport is not None:
+            self.plumbing.reactor.forget(self._transport)
+            self._transport.close()
+        self._transport = self.flow = None
+
+    def _tell(self, kind: LinkKind, detail: str) -> None:
+        self.plumbing.emit(LinkEvent(kind, str(self.endpoint), self.owners, detail, self.idcode, self.flow))
+
+
+_REQUEST_IN = {
+    ClientState.WAIT_CFG3: ClientAction.REQUEST_CFG3,
+    ClientState.WAIT_CFG2: ClientAction.REQUEST_CFG2,
+    ClientState.WAIT_DATA: ClientAction.SEND_START,
+}
+
+
+def _local(iface: str | None, over_tcp: bool) -> Address | None:
+    """The local address a connection is made from, if ``iface`` names one."""
+    try:
+        return None if iface is None else resolve(str(ipaddress.ip_address(iface)), 0, datagram=not over_tcp)
+    except ValueError:
+        raise SettingsError(f"iface={iface}: a connection is made from an address of this machine") from None

@@ -1,0 +1,92 @@
+"""One selector loop: handlers for sockets that are ready, callbacks for times that have come.
+
+Single-threaded: a handler runs to its end before the next, so nothing here or in its users needs a lock.
+"""
+
+from __future__ import annotations
+
+import heapq
+import selectors
+from collections.abc import Callable
+from itertools import count
+from typing import Protocol
+
+from pmutools.clock import Clock, VirtualClock
+
+READ = selectors.EVENT_READ
+WRITE = selectors.EVENT_WRITE
+
+
+class HasFileno(Protocol):
+    def fileno(self) -> int: ...
+
+
+class Timer:
+    """A callback to come; setting ``cancelled`` keeps it from coming."""
+
+    __slots__ = ("callback", "cancelled", "deadline_ns")
+
+    def __init__(self, deadline_ns: int, callback: Callable[[], None]) -> None:
+        self.deadline_ns = deadline_ns
+        self.callback = callback
+        self.cancelled = False
+
+
+class Reactor:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self._selector = selectors.DefaultSelector()
+        self._timers: list[tuple[int, int, Timer]] = []
+        self._order = count()
+        self._forgotten: set[int] = set()
+
+    def watch(self, source: HasFileno, events: int, handler: Callable[[int], None]) -> None:
+        """Call ``handler(events)`` when ``source`` is ready; replaces what was watched before."""
+        try:
+            self._selector.modify(source, events, handler)
+        except KeyError:
+            self._selector.register(source, events, handler)
+
+    def forget(self, source: HasFileno) -> None:
+        """Stop watching, before ``source`` is closed; nothing happens if it was not watched."""
+        try:
+            self._forgotten.add(self._selector.unregister(source).fd)
+        except (KeyError, ValueError):
+            return
+
+    def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> Timer:
+        """Call back once the monotonic clock reads ``deadline_ns``."""
+        timer = Timer(deadline_ns, callback)
+        heapq.heappush(self._timers, (deadline_ns, next(self._order), timer))
+        return timer
+
+    def call_in(self, delay_ns: int, callback: Callable[[], None]) -> Timer:
+        return self.call_at(self.clock.monotonic_ns() + delay_ns, callback)
+
+    def run(self, timeout_ns: int | None) -> None:
+        """Wait until something is ready or due, at most ``timeout_ns`` (None: however long), and handle all of it."""
+        timers = self._timers
+        if timers:
+            next_ns = max(timers[0][0] - self.clock.monotonic_ns(), 0)
+            timeout_ns = next_ns if timeout_ns is None else min(timeout_ns, next_ns)
+        self._forgotten.clear()
+        for key, events in self._select(timeout_ns):
+            if key.fd not in self._forgotten:  # else an earlier handler of this round has closed it
+                key.data(events)
+        now_ns = self.clock.monotonic_ns()
+        while timers and timers[0][0] <= now_ns:
+            timer = heapq.heappop(timers)[2]
+            if not timer.cancelled:
+                timer.callback()
+
+    def _select(self, timeout_ns: int | None) -> list[tuple[selectors.SelectorKey, int]]:
+        if isinstance(self.clock, VirtualClock):  # its time does not pass while the selector waits
+            ready = self._selector.select(0)
+            if not ready:
+                self.clock.advance(timeout_ns or 0)
+            return ready
+        return self._selector.select(None if timeout_ns is None else timeout_ns / 1e9)
+
+    def close(self) -> None:
+        self._selector.close()
+        self._timers.clear()

@@ -1,0 +1,264 @@
+"""The front end of everything that sends: streams published to fixed destinations and to clients that ask for them.
+
+::
+
+    with Senders(SystemClock()) as senders:
+        stream = senders.add(served(config))                                    # a handle
+        senders.send_to(parse_endpoint("udp://239.1.2.3:4713"), [stream])       # spontaneous
+        senders.listen(parse_endpoint("tcp://0.0.0.0:4712"), [stream])          # a PMU or PDC that answers commands
+        senders.announce()                                                      # configurations of spontaneous streams
+        while ...:
+            events = senders.serve_until(deadline_ns)                           # commands are answered meanwhile
+            senders.publish([(stream, frame), ...])                             # one tick, one system call where it can
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterable, Sequence
+from types import TracebackType
+
+from pmutools import linux
+from pmutools.c37118.constants import FrameType
+from pmutools.c37118.session import Served
+from pmutools.clock import Clock
+from pmutools.errors import SettingsError
+from pmutools.net.audience import Audience, Flushable, Outbox, UdpSink
+from pmutools.net.endpoint import Endpoint, Scheme, is_multicast
+from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
+from pmutools.net.reactor import Reactor
+from pmutools.net.sockets import Address, resolve
+from pmutools.net.tcp import QUEUE_BYTES
+from pmutools.net.udp import Batches, UdpSocket, target
+
+CFG_PERIOD_NS = 60_000_000_000
+HOUSEKEEPING_NS = 1_000_000_000
+COARSE_NS = 2_000_000
+"""How long before a deadline waiting for sockets, in whole milliseconds, gives way to an exact sleep."""
+_SHARES = 64
+"""A period's configurations leave in so many portions, not in one burst."""
+_SENDING_RCVBUF = 4096
+_ANNOUNCED = (FrameType.CFG2, FrameType.CFG3)
+
+
+class Senders:
+    """See the module's text. Not thread-safe; close it, or use it in a ``with``.
+
+    Parameters
+    ----------
+    cfg_period_ns
+        How often spontaneous streams repeat their configuration (CFG-2); None: only in :meth:`announce`.
+    queue_bytes
+        Bytes that may wait for one TCP client; frames beyond are dropped for it, and counted.
+    native
+        False takes the portable path: a system call a datagram.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        cfg_period_ns: int | None = CFG_PERIOD_NS,
+        queue_bytes: int = QUEUE_BYTES,
+        native: bool = linux.NATIVE,
+    ) -> None:
+        self._clock = clock
+        self._native = native
+        self._queue_bytes = queue_bytes
+        self._batches = Batches() if native else None
+        self._reactor = Reactor(clock)
+        self._audience = Audience()
+        self._events: list[ServerEvent] = []
+        self._dirty: list[Flushable] = []
+        self._stage = Stage(
+            self._reactor, self._audience, self._events.append, self._dirty, self._data_box, self._batches, native
+        )
+        self._served: list[Served] = []
+        self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
+        self._boxes: dict[tuple[str, str | None, int | None], Outbox] = {}
+        self._spontaneous: list[list[UdpSink]] = []
+        self._last_poll_ns = 0
+        self._share = 0
+        if cfg_period_ns is not None:
+            self._share_ns = max(cfg_period_ns // _SHARES, 1)
+            self._reactor.call_in(self._share_ns, self._announce_share)
+        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
+
+    def __enter__(self) -> Senders:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- what is sent, and where
+
+    def add(self, stream: Served) -> int:
+        """Offer a stream; returns its handle. Nobody gets it before :meth:`send_to` or :meth:`listen`."""
+        self._served.append(stream)
+        self._audience.sinks.append([])
+        self._spontaneous.append([])
+        return len(self._served) - 1
+
+    def replace(self, handle: int, stream: Served) -> None:
+        """The stream has another configuration from now on; its IDCODE stays."""
+        if stream.idcode != self._served[handle].idcode:
+            raise ValueError(f"stream {handle} is {self._served[handle].idcode}, not {stream.idcode}")
+        before, self._served[handle] = self._served[handle], stream
+        for streams, _ in self._outlets:
+            if streams.get(stream.idcode) is before:
+                streams[stream.idcode] = stream
+
+    def send_to(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
+        """Send streams to a UDP address without being asked; returns the outlet's number.
+
+        ``iface`` and ``ttl`` of the endpoint choose how multicast leaves, ``source`` the address it comes from. Raises
+        SourceError for an unknown host or a source that is not local, SettingsError for an endpoint that is served.
+        """
+        if endpoint.scheme is not Scheme.UDP:
+            raise SettingsError(f"{endpoint}: {endpoint.scheme}:// is served to those who connect; use --listen for it")
+        if not endpoint.port:
+            raise SettingsError(f"{endpoint}: port 0 is nowhere to send to")
+        where = target(resolve(endpoint.host, endpoint.port, datagram=True))
+        group = is_multicast(where.address.host)
+        local = endpoint.source or ("::" if where.address.family == socket.AF_INET6 else "0.0.0.0")
+        box = self._box(local, endpoint.iface if group else None, endpoint.ttl)
+        for handle in streams:
+            sink = UdpSink(box, where)
+            self._audience.sinks[handle].append(sink)
+            self._spontaneous[handle].append(sink)
+        self._outlets.append(({}, None))
+        return len(self._outlets) - 1
+
+    def listen(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
+        """Serve streams to clients that ask for them; returns the outlet's number.
+
+        Raises SourceError where the port is taken or not permitted, SettingsError for two streams of one IDCODE.
+        """
+        if endpoint.scheme is Scheme.UDP:
+            raise SettingsError(f"{endpoint}: udp:// knows no commands; use udp+cmd://, or send to it with --to")
+        offered: dict[int, Served] = {}
+        handles: dict[int, int] = {}
+        for handle in streams:
+            stream = self._served[handle]
+            if stream.idcode in offered:
+                raise SettingsError(
+                    f"{endpoint}: two streams of IDCODE {stream.idcode}; renumber one (--idcode OLD=NEW)"
+                )
+            offered[stream.idcode] = stream
+            handles[stream.idcode] = handle
+        number = len(self._outlets)
+        outlet: TcpOutlet | UdpOutlet
+        if endpoint.scheme is Scheme.UDP_COMMANDED:
+            outlet = UdpOutlet(number, endpoint, offered, handles, self._stage)
+        else:
+            outlet = TcpOutlet(number, endpoint, offered, handles, self._stage, self._queue_bytes)
+        self._outlets.append((offered, outlet))
+        return number
+
+    def local(self, outlet: int) -> Address | None:
+        """Where an outlet listens; None for one that only sends."""
+        listening = self._outlets[outlet][1]
+        return listening.address if listening is not None else None
+
+    def audience(self, stream: int) -> int:
+        """How many destinations a frame of this stream would go to now."""
+        return len(self._audience.sinks[stream])
+
+    # --- running
+
+    def publish(self, frames: Iterable[tuple[int, bytes]]) -> list[int]:
+        """Send (stream, frame) pairs to whoever is to have them, now, in this order for each destination.
+
+        Returns the places in ``frames`` of those that a destination did not take: a full queue, or a system error.
+        """
+        now_ns = self._clock.monotonic_ns()
+        sinks = self._audience.sinks
+        failed: list[int] = []
+        for mark, (stream, frame) in enumerate(frames):
+            failed += [mark for sink in sinks[stream] if not sink.put(frame, mark, now_ns)]
+        return failed + self._flush()
+
+    def announce(self, streams: Iterable[int] | None = None) -> None:
+        """Send the configurations of spontaneous streams (default: all), stamped with the present time."""
+        utc_ns = self._clock.realtime_ns()
+        for handle in range(len(self._served)) if streams is None else streams:
+            sinks = self._spontaneous[handle]
+            if not sinks:
+                continue
+            kind = next((kind for kind in _ANNOUNCED if kind in self._served[handle].frames), None)
+            frame = self._served[handle].frame(kind, utc_ns) if kind is not None else None
+            if frame is not None:
+                for sink in sinks:
+                    sink.put(frame, 0, 0)
+        self._flush()
+
+    def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
+        """Answer clients and repeat configurations; waits for something to do at most ``timeout_ns``."""
+        self._reactor.run(0 if self._events else timeout_ns)
+        self._last_poll_ns = self._clock.monotonic_ns()
+        events = self._events[:]
+        self._events.clear()
+        return events
+
+    def serve_until(self, deadline_ns: int) -> list[ServerEvent]:
+        """Answer clients until the monotonic clock reads ``deadline_ns``; back earlier only with events.
+
+        The last milliseconds are an exact sleep, so clients wait that long for an answer. Where deadlines follow each
+        other closely, sockets are looked at every few milliseconds.
+        """
+        while (left_ns := deadline_ns - self._clock.monotonic_ns()) > COARSE_NS:
+            if events := self.poll(left_ns - COARSE_NS):
+                return events
+        if self._clock.monotonic_ns() - self._last_poll_ns > 2 * COARSE_NS and (events := self.poll(0)):
+            return events
+        self._clock.sleep_until(deadline_ns)
+        return []
+
+    def disconnect(self, outlet: int, *, reset: bool = False) -> None:
+        """Send all TCP clients of an outlet away, with FIN or with RST; they may come back."""
+        listening = self._outlets[outlet][1]
+        if isinstance(listening, TcpOutlet):
+            listening.disconnect(reset=reset)
+
+    def close(self) -> None:
+        for _, outlet in self._outlets:
+            if outlet is not None:
+                outlet.close()
+        for box in self._boxes.values():
+            box.sock.close()
+        self._outlets.clear()
+        self._boxes.clear()
+        self._reactor.close()
+
+    # --- inside
+
+    def _flush(self) -> list[int]:
+        failed: list[int] = []
+        while self._dirty:
+            failed += self._dirty.pop().flush()
+        return failed
+
+    def _box(self, local: str, iface: str | None, ttl: int | None) -> Outbox:
+        box = self._boxes.get((local, iface, ttl))
+        if box is None:
+            sock = UdpSocket(local, 0, rcvbuf_bytes=_SENDING_RCVBUF, batches=self._batches, native=self._native)
+            sock.send_via(iface=iface, ttl=ttl)
+            box = self._boxes[local, iface, ttl] = Outbox(sock, self._dirty)
+        return box
+
+    def _data_box(self, family: int) -> Outbox:
+        return self._box("::" if family == socket.AF_INET6 else "0.0.0.0", None, None)
+
+    def _announce_share(self) -> None:
+        self.announce(range(self._share, len(self._served), _SHARES))
+        self._share = (self._share + 1) % _SHARES
+        self._reactor.call_in(self._share_ns, self._announce_share)
+
+    def _keep_house(self) -> None:
+        now_ns = self._clock.monotonic_ns()
+        for _, outlet in self._outlets:
+            if outlet is not None:
+                outlet.keep_house(now_ns)
+        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)

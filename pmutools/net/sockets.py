@@ -1,0 +1,132 @@
+"""What every socket here needs: addresses resolved, buffers sized, and failures told in one useful line."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+import sys
+from typing import NamedTuple
+
+from pmutools import linux
+from pmutools.errors import SourceError
+from pmutools.net.endpoint import join_host
+
+RCVBUF_BYTES = 16 << 20
+"""Receive buffer asked for: two seconds of 100,000 small datagrams, each charged some 0.8 KiB by the kernel."""
+
+SNDBUF_BYTES = 8 << 20
+"""Send buffer asked for: a tick of some thousand streams, while the network card takes it."""
+
+
+class Address(NamedTuple):
+    """A resolved address: its family, and the tuple that the socket module takes."""
+
+    family: int
+    sockaddr: tuple[str, int] | tuple[str, int, int, int]
+
+    @property
+    def host(self) -> str:
+        return self.sockaddr[0]
+
+    @property
+    def port(self) -> int:
+        return self.sockaddr[1]
+
+    def __str__(self) -> str:
+        return join_host(self.host, self.port)
+
+
+def resolve(host: str, port: int, *, datagram: bool, family: int = socket.AF_UNSPEC) -> Address:
+    """The first address of ``host``; raises SourceError where there is none. May ask a name server, and wait for it."""
+    kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
+    try:
+        found = socket.getaddrinfo(host, port, socket.AddressFamily(family), kind)
+    except (OSError, UnicodeError):
+        raise SourceError(
+            f"{join_host(host, port)}: unknown host {host!r}; check the name, or give an address"
+        ) from None
+    numeric, sockaddr = found[0][0], found[0][4]
+    return Address(numeric, (str(sockaddr[0]), *sockaddr[1:]))
+
+
+_REMEDIES = {
+    errno.EADDRINUSE: "already in use; stop the other program that has this port, or choose another",
+    errno.EADDRNOTAVAIL: "this machine does not have that address; use 0.0.0.0 for every local address",
+    errno.EACCES: "not permitted; ports below 1024 need privilege, broadcast addresses a network that allows them",
+    errno.EPERM: "not permitted; does a local firewall forbid it?",
+    errno.ECONNREFUSED: "refused: nothing serves this port; is the device on, and the port right?",
+    errno.ECONNRESET: "the other side reset the connection",
+    errno.EPIPE: "the other side closed the connection",
+    errno.ETIMEDOUT: "no answer; is the device reachable, or a firewall in between?",
+    errno.EHOSTUNREACH: "no route to this host",
+    errno.ENETUNREACH: "no route to this network",
+    errno.ENODEV: "no such network interface",
+    errno.EMFILE: "too many open files; raise the limit (ulimit -n)",
+}
+
+
+def explain(error: OSError, where: object) -> SourceError:
+    """``error`` as one line that names ``where`` and says what to do."""
+    reason = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
+    return SourceError(f"{where}: {reason}")
+
+
+def raise_rcvbuf(sock: socket.socket, nbytes: int = RCVBUF_BYTES) -> int:
+    """Ask for a receive buffer; returns what the kernel gave (Linux gives, and reports, twice the size asked for)."""
+    return _raise_buffer(sock, nbytes, linux.SO_RCVBUFFORCE, socket.SO_RCVBUF)
+
+
+def raise_sndbuf(sock: socket.socket, nbytes: int = SNDBUF_BYTES) -> int:
+    """Ask for a send buffer; returns what the kernel gave."""
+    return _raise_buffer(sock, nbytes, linux.SO_SNDBUFFORCE, socket.SO_SNDBUF)
+
+
+def _raise_buffer(sock: socket.socket, nbytes: int, force: int, ask: int) -> int:
+    modest = 1 << 18
+    options = (
+        ((force, nbytes),) if sys.platform == "linux" else ()
+    )  # needs CAP_NET_ADMIN; else the system's limit holds
+    for option, size in (*options, (ask, nbytes), (ask, modest)):
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, option, size)
+        except OSError:
+            continue
+        break
+    return sock.getsockopt(socket.SOL_SOCKET, ask)
+
+
+def stamp_arrivals(sock: socket.socket) -> bool:
+    """Have the kernel stamp what arrives (CLOCK_REALTIME); false where it cannot."""
+    if not linux.NATIVE:
+        return False
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPNS, 1)
+    except OSError:
+        return False
+    return True
+
+
+# --- the kernel's form of an address ----------------------------------------------------------------------------
+
+_IN = struct.Struct("=H2s4s8x")
+_IN6 = struct.Struct("=H2sI16sI")
+
+
+def pack_sockaddr(address: Address) -> bytes:
+    """``struct sockaddr_in`` or ``sockaddr_in6`` of Linux."""
+    port = address.port.to_bytes(2, "big")
+    if address.family == socket.AF_INET:
+        return _IN.pack(address.family, port, socket.inet_aton(address.host))
+    scope = address.sockaddr[3] if len(address.sockaddr) == 4 else 0
+    raw = socket.inet_pton(socket.AF_INET6, address.host.partition("%")[0])
+    return _IN6.pack(address.family, port, 0, raw, scope)
+
+
+def unpack_sockaddr(raw: bytes) -> Address:
+    """The inverse of :func:`pack_sockaddr`."""
+    if len(raw) == _IN.size:
+        family, port, host = _IN.unpack(raw)
+        return Address(family, (socket.inet_ntoa(host), int.from_bytes(port, "big")))
+    family, port, _flow, host, scope = _IN6.unpack(raw)
+    return Address(family, (socket.inet_ntop(socket.AF_INET6, host), int.from_bytes(port, "big"), 0, scope))

@@ -1,0 +1,223 @@
+"""TCP connections, non-blocking: a client's that stamps what it reads, and a server's whose send queue is bounded.
+
+A read takes what has come, once a wake-up, with the kernel's stamp of its newest segment. The kernel merges segments
+that wait, so frames that share a read share that stamp: an upper bound for all but the last of them, which the framer
+marks as batched.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import struct
+import sys
+import time
+
+from pmutools import linux
+from pmutools.flow import Chunk, Flow, StampSource
+from pmutools.net.sockets import Address, explain, resolve, stamp_arrivals
+
+READ_BYTES = 256 << 10
+QUEUE_BYTES = 256 << 10
+"""Bytes that may wait for one slow client, beside the kernel's send buffer of the same size."""
+STALL_NS = 10_000_000_000
+"""A client that takes nothing for so long while bytes wait for it is disconnected."""
+_BACKLOG = 128
+_VANISHED_MS = 30_000
+
+
+class TcpClient:
+    """A connection to a server, being made (until :meth:`finish`) or made.
+
+    ``connection`` numbers the connections to this server, for the flow. ``native=False`` stamps in user space.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        *,
+        local: Address | None = None,
+        connection: int = 0,
+        native: bool = linux.NATIVE,
+    ) -> None:
+        self.address = address
+        self.flow = Flow("tcp", str(address), "", connection)
+        self._sock = sock = socket.socket(address.family, socket.SOCK_STREAM)
+        self._buffer = memoryview(bytearray(READ_BYTES))
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            self.stamps = native and hasattr(sock, "recvmsg_into") and stamp_arrivals(sock)
+            if local is not None:
+                sock.bind(local.sockaddr)
+            error = sock.connect_ex(address.sockaddr)
+        except OSError as failure:
+            sock.close()
+            raise explain(failure, f"tcp://{address}") from None
+        self._refused = error if error not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK) else 0
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        self._sock.close()
+
+    def finish(self) -> None:
+        """The socket has become writable: the connection is made, or OSError says why not."""
+        error = self._refused or self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if error:
+            raise OSError(error, os.strerror(error))
+        self.flow = self.flow._replace(destination=str(Address(self.address.family, self._sock.getsockname())))
+
+    def read(self) -> Chunk | None:
+        """What has come, or None; raises OSError when the connection is closed (EPIPE) or broken."""
+        try:
+            size, stamp_ns = self._receive()
+        except (BlockingIOError, InterruptedError):
+            return None
+        if not size:
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+        data = bytes(self._buffer[:size])
+        if stamp_ns is None:
+            return Chunk(data, time.time_ns(), self.flow, StampSource.USER)
+        return Chunk(data, stamp_ns, self.flow, StampSource.KERNEL)
+
+    def _receive(self) -> tuple[int, int | None]:
+        if not self.stamps:
+            return self._sock.recv_into(self._buffer), None
+        size, control, _flags, _sender = self._sock.recvmsg_into([self._buffer], 128)
+        for level, kind, value in control:
+            if level == socket.SOL_SOCKET and kind == linux.SO_TIMESTAMPNS:
+                seconds, nanoseconds = struct.unpack("@qq", value)
+                return size, seconds * 1_000_000_000 + nanoseconds
+        return size, None
+
+    def send(self, frame: bytes) -> bool:
+        """Send a command; false where the server takes none, which on such a connection means it is dead."""
+        try:
+            return self._sock.send(frame) == len(frame)
+        except OSError:
+            return False
+
+
+class TcpListener:
+    """A listening socket; raises SourceError where the port is taken or not permitted."""
+
+    def __init__(self, host: str, port: int) -> None:
+        wanted = resolve(host, port, datagram=False)
+        self._sock = sock = socket.socket(wanted.family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            if wanted.family == socket.AF_INET6:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            if sys.platform != "win32":  # a new start need not wait for old connections; on Windows it means sharing
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(wanted.sockaddr)
+            sock.listen(_BACKLOG)
+        except OSError as error:
+            sock.close()
+            raise explain(error, f"tcp://{wanted}") from None
+        self.address = Address(wanted.family, sock.getsockname())
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        self._sock.close()
+
+    def accept(self, queue_bytes: int = QUEUE_BYTES) -> TcpPeer | None:
+        """The next waiting client, or None; raises OSError where the process has no socket left for it."""
+        try:
+            sock, sender = self._sock.accept()
+        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+            return None
+        try:
+            return TcpPeer(sock, Address(self.address.family, sender), self.address, queue_bytes)
+        except OSError:  # gone again already
+            sock.close()
+            return None
+
+
+class TcpPeer:
+    """A client of ours. What it does not take at once waits in a queue of at most ``queue_bytes``.
+
+    Frames that do not fit are dropped, whole, and counted: a slow client sees a gap, never half a frame.
+    """
+
+    def __init__(self, sock: socket.socket, address: Address, local: Address, queue_bytes: int = QUEUE_BYTES) -> None:
+        self.address = address
+        self.flow = Flow("tcp", str(address), str(local))
+        self.queue_bytes = queue_bytes
+        self.dropped = 0
+        self._sock = sock
+        self._queue = bytearray()
+        self._stuck_since_ns: int | None = None
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, queue_bytes)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # a client that has vanished acknowledges nothing
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _VANISHED_MS)
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self, *, reset: bool = False) -> None:
+        """End the connection with FIN, or with RST and whatever waits thrown away."""
+        if reset:
+            self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("@ii", 1, 0))
+        self._sock.close()
+
+    @property
+    def queued_bytes(self) -> int:
+        return len(self._queue)
+
+    def put(self, frame: bytes, now_ns: int) -> bool:
+        """Send, or queue, one frame whole; false if it was dropped. ``now_ns`` is monotonic.
+
+        Raises OSError when the connection is broken.
+        """
+        if not self._queue:
+            sent = self._send(frame)
+            if sent == len(frame):
+                return True
+            self._stuck_since_ns = now_ns
+            self._queue += frame[sent:]
+            return True
+        if len(self._queue) + len(frame) > self.queue_bytes:
+            self.dropped += 1
+            return False
+        self._queue += frame
+        return True
+
+    def flush(self, now_ns: int) -> None:
+        """Send from the queue what the client takes; raises OSError when the connection is broken."""
+        while self._queue:
+            with memoryview(self._queue) as view:
+                sent = self._send(view[:READ_BYTES])
+            if not sent:
+                return
+            del self._queue[:sent]
+            self._stuck_since_ns = now_ns
+        self._stuck_since_ns = None
+
+    def stalled(self, now_ns: int) -> bool:
+        """Whether bytes have waited :data:`STALL_NS` without the client taking any."""
+        return self._stuck_since_ns is not None and now_ns - self._stuck_since_ns > STALL_NS
+
+    def read(self) -> bytes:
+        """What the client sent, empty if nothing; raises OSError when the connection is closed (EPIPE) or broken."""
+        try:
+            data = self._sock.recv(1 << 16)
+        except (BlockingIOError, InterruptedError):
+            return b""
+        if not data:
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+        return data
+
+    def _send(self, data: bytes | memoryview) -> int:
+        try:
+            return self._sock.send(data)
+        except (BlockingIOError, InterruptedError):
+            return 0

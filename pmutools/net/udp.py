@@ -1,0 +1,285 @@
+"""UDP sockets that keep count: kernel arrival stamps, own drops, multicast, datagrams in batches.
+
+A datagram holds whole frames, so each is one :class:`~pmutools.flow.Chunk`. Over the native path many datagrams are
+taken, and sent, by one system call; the portable path does the same one by one, and stamps arrivals itself.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import struct
+import sys
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pmutools import linux
+from pmutools.errors import SettingsError
+from pmutools.flow import Chunk, Flow, StampSource
+from pmutools.net.endpoint import is_multicast
+from pmutools.net.sockets import (
+    RCVBUF_BYTES,
+    Address,
+    explain,
+    pack_sockaddr,
+    raise_rcvbuf,
+    raise_sndbuf,
+    resolve,
+    stamp_arrivals,
+    unpack_sockaddr,
+)
+
+READ_BATCHES = 4
+"""Batches taken from one socket before the others have their turn."""
+_FLOWS = 1 << 16
+_DATAGRAM_BYTES = 1 << 16
+_PORTABLE_BATCH = 64
+
+
+class Target(NamedTuple):
+    """A destination, resolved once."""
+
+    address: Address
+    sockaddr: linux.SockAddr
+
+
+def target(address: Address) -> Target:
+    return Target(address, linux.SockAddr(pack_sockaddr(address)))
+
+
+class Batches:
+    """The buffers of the native path, to be shared by all sockets of a thread."""
+
+    def __init__(self) -> None:
+        self.receive = linux.ReceiveBatch()
+        self.send = linux.SendBatch()
+
+
+class UdpSocket:
+    """A bound UDP socket, non-blocking.
+
+    Parameters
+    ----------
+    host, port
+        Local address; a multicast group binds to the group and joins nothing yet (:meth:`join`). Port 0: any.
+    rcvbuf_bytes
+        Receive buffer to ask for; ``rcvbuf_bytes`` then says what was got.
+    batches
+        Shared buffers; None takes new ones.
+    native
+        False takes the portable path: one call a datagram, arrival stamps from user space.
+
+    Raises
+    ------
+    SourceError
+        The port is taken, the address is not local, or not permitted.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        rcvbuf_bytes: int = RCVBUF_BYTES,
+        batches: Batches | None = None,
+        native: bool = linux.NATIVE,
+    ) -> None:
+        wanted = resolve(host, port, datagram=True)
+        group = is_multicast(wanted.host)
+        if group and sys.platform == "win32":  # binding to a group is refused there
+            wanted = resolve("::" if wanted.family == socket.AF_INET6 else "0.0.0.0", port, datagram=True)
+        self._batches = (batches or Batches()) if native else None
+        self._sock = sock = socket.socket(wanted.family, socket.SOCK_DGRAM)
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            if wanted.family == socket.AF_INET6:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            if group:  # several listeners to one group on one machine are normal
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                _only_joined_groups(sock, wanted.family)
+            self.rcvbuf_bytes = raise_rcvbuf(sock, rcvbuf_bytes)
+            raise_sndbuf(sock)
+            self.stamps = native and stamp_arrivals(sock)
+            sock.bind(wanted.sockaddr)
+        except OSError as error:
+            sock.close()
+            raise explain(error, f"udp://{wanted}") from None
+        self.address = Address(wanted.family, sock.getsockname())
+        self._flows: dict[bytes | tuple[str, int], Flow] = {}
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        self._sock.close()
+
+    # --- receiving
+
+    def join(self, group: str, *, iface: str | None = None, source: str | None = None) -> None:
+        """Join a multicast group on an interface (address or name; None: the system chooses), from one source or any.
+
+        Raises SourceError where the system refuses, SettingsError for an interface that is none.
+        """
+        try:
+            self._sock.setsockopt(*_membership(ipaddress.ip_address(group), iface, source))
+        except OSError as error:
+            raise explain(error, f"multicast group {group}{f' on {iface}' if iface else ''}") from None
+
+    def connect(self, address: Address) -> None:
+        """Talk to one peer only: datagrams from others are not seen, and a closed port there shows as refused."""
+        try:
+            self._sock.connect(address.sockaddr)
+        except OSError as error:
+            raise explain(error, f"udp://{address}") from None
+        self.address = Address(address.family, self._sock.getsockname())
+        self._flows.clear()
+
+    def read(self) -> list[Chunk]:
+        """What has arrived, at most a few batches; empty when nothing waits.
+
+        Raises
+        ------
+        OSError
+            On a connected socket: the peer's port is closed (ECONNREFUSED). The socket stays usable.
+        """
+        if self._batches is None:
+            return self._read_portable()
+        chunks: list[Chunk] = []
+        receive, fd = self._batches.receive, self._sock.fileno()
+        for _ in range(READ_BATCHES):
+            datagrams = receive.receive(fd)
+            for data, sockaddr, stamp_ns in datagrams:
+                flow = self._flows.get(sockaddr) or self._new_flow(sockaddr, unpack_sockaddr(sockaddr))
+                if stamp_ns is None:
+                    chunks.append(Chunk(data, time.time_ns(), flow, StampSource.USER))
+                else:
+                    chunks.append(Chunk(data, stamp_ns, flow, StampSource.KERNEL))
+            if len(datagrams) < receive.size:
+                break
+        return chunks
+
+    def _read_portable(self) -> list[Chunk]:
+        chunks: list[Chunk] = []
+        for _ in range(READ_BATCHES * _PORTABLE_BATCH):
+            try:
+                data, sender = self._sock.recvfrom(_DATAGRAM_BYTES)
+            except (BlockingIOError, InterruptedError):
+                break
+            key = (sender[0], sender[1])
+            flow = self._flows.get(key) or self._new_flow(key, Address(self.address.family, sender))
+            chunks.append(Chunk(data, time.time_ns(), flow, StampSource.USER))
+        return chunks
+
+    def _new_flow(self, key: bytes | tuple[str, int], sender: Address) -> Flow:
+        if len(self._flows) >= _FLOWS:  # a flood of spoofed senders: begin the cache again
+            self._flows.clear()
+        flow = self._flows[key] = Flow("udp", str(sender), str(self.address))
+        return flow
+
+    @property
+    def own_drops(self) -> int | None:
+        """Datagrams that this socket's full buffer has lost since it was opened (32 bits, wraps); None if unknown."""
+        try:
+            info = self._sock.getsockopt(socket.SOL_SOCKET, linux.SO_MEMINFO, 36) if linux.NATIVE else b""
+        except OSError:
+            return None
+        return int(struct.unpack_from("=I", info, 4 * linux.MEMINFO_DROPS)[0]) if len(info) == 36 else None
+
+    # --- sending
+
+    def send_via(self, *, iface: str | None = None, ttl: int | None = None) -> None:
+        """Choose the interface and the time to live of what is sent to multicast groups."""
+        try:
+            if iface is not None:
+                self._sock.setsockopt(*_outgoing(self.address.family, iface))
+            if ttl is not None:
+                level, option = _MULTICAST_TTL[self.address.family]
+                self._sock.setsockopt(level, option, ttl)
+        except OSError as error:
+            raise explain(error, f"multicast on {iface}") from None
+
+    def send(self, frames: Sequence[bytes], targets: Sequence[Target]) -> list[int]:
+        """Send ``frames[i]`` to ``targets[i]``; returns the indices of those the system would not take."""
+        if self._batches is not None and len(frames) > 1:
+            return self._batches.send.send(self._sock.fileno(), frames, [where.sockaddr for where in targets])
+        failed = []
+        for index, (frame, where) in enumerate(zip(frames, targets, strict=True)):
+            try:
+                self._sock.sendto(frame, where.address.sockaddr)
+            except OSError:
+                failed.append(index)
+        return failed
+
+    def send_connected(self, frame: bytes) -> bool:
+        """Send to the peer of :meth:`connect`; false if the system would not take it."""
+        try:
+            self._sock.send(frame)
+        except OSError:
+            return False
+        return True
+
+
+_MULTICAST_TTL: dict[int, tuple[int, int]] = {
+    socket.AF_INET: (socket.IPPROTO_IP, socket.IP_MULTICAST_TTL),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS),
+}
+
+
+def _only_joined_groups(sock: socket.socket, family: int) -> None:
+    """By default a Linux socket also gets the groups that other sockets on the machine have joined."""
+    if sys.platform == "linux" and family == socket.AF_INET:
+        sock.setsockopt(socket.IPPROTO_IP, linux.IP_MULTICAST_ALL, 0)
+
+
+def _index(iface: str | None) -> int:
+    if iface is None:
+        return 0
+    try:
+        return socket.if_nametoindex(iface)
+    except OSError:
+        raise SettingsError(f"iface={iface}: neither an address nor an interface of this machine") from None
+
+
+def _ipv4(iface: str | None) -> tuple[bytes, int]:
+    """An interface as (address, index), whichever of the two it is given by."""
+    try:
+        return socket.inet_aton(str(ipaddress.IPv4Address(iface or "0.0.0.0"))), 0
+    except ValueError:
+        return bytes(4), _index(iface)
+
+
+def _outgoing(family: int, iface: str) -> tuple[int, int, bytes]:
+    if family == socket.AF_INET6:
+        return socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, struct.pack("@I", _index(iface))
+    address, index = _ipv4(iface)
+    request = struct.pack("@4s4si", bytes(4), address, index) if index else address
+    return socket.IPPROTO_IP, socket.IP_MULTICAST_IF, request
+
+
+def _membership(
+    group: ipaddress.IPv4Address | ipaddress.IPv6Address, iface: str | None, source: str | None
+) -> tuple[int, int, bytes]:
+    """setsockopt arguments: ip_mreq(n), ip_mreq_source, ipv6_mreq or group_source_req."""
+    if isinstance(group, ipaddress.IPv6Address):
+        index = _index(iface or group.scope_id)
+        if source is None:
+            return socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, struct.pack("@16sI", group.packed, index)
+        both = (struct.pack("=HHI16sI100x", socket.AF_INET6, 0, 0, raw, 0) for raw in (group.packed, _packed6(source)))
+        return socket.IPPROTO_IPV6, linux.MCAST_JOIN_SOURCE_GROUP, struct.pack("@I4x128s128s", index, *both)
+    local, index = _ipv4(iface)
+    if source is not None:
+        if index:
+            raise SettingsError(f"iface={iface}: with source= an interface is given by its address")
+        request = struct.pack("=4s4s4s", group.packed, local, socket.inet_aton(source))
+        return socket.IPPROTO_IP, linux.IP_ADD_SOURCE_MEMBERSHIP, request
+    request = struct.pack("@4s4si", group.packed, local, index) if index else group.packed + local
+    return socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request
+
+
+def _packed6(source: str) -> bytes:
+    try:
+        return ipaddress.IPv6Address(source).packed
+    except ValueError:
+        raise SettingsError(f"source={source}: an IPv6 group has IPv6 sources") from None
