@@ -93,13 +93,12 @@ class MessageSource:
 class TableSource:
     """A recording of numbers: blocks whose frames are encoded when frames are asked for."""
 
-    def __init__(self, path: Path, kind: str, blocks: Iterable[Block]) -> None:
-        self.path, self.kind = path, kind
+    def __init__(
+        self, path: Path, kind: str, blocks: Iterable[Block], defects: Callable[[], dict[str, int]] = dict
+    ) -> None:
+        self.path, self.kind, self.defects = path, kind, defects
         self._blocks = blocks
         self.tally = Tally()
-
-    def defects(self) -> dict[str, int]:
-        return {}
 
     def blocks(self) -> Iterator[Block | Message | Loss]:
         for block in self._blocks:

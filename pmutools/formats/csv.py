@@ -1,0 +1,127 @@
+"""``.csv`` tables: ``time`` in ISO-8601 UTC first, then the columns of the other tables; blank where nothing is known.
+
+Floats have as many digits as bring them back exactly. A CSV has no metadata: reading infers the configuration
+(:mod:`pmutools.formats.infer`), so frames made from it are all float. Files with the four header rows of the test-case
+library (``T`` first in the second row) are handed to :mod:`pmutools.formats.ieee_csv`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator
+from itertools import compress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools.c37118.batch import NO_TIME
+from pmutools.c37118.config import StreamConfig
+from pmutools.errors import SourceError
+from pmutools.formats import ieee_csv
+from pmutools.formats.columns import FrameValues, unique
+from pmutools.formats.files import OutputFile, TextTable, without_blank_end
+from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
+from pmutools.formats.sink import SinkOptions
+from pmutools.formats.source import TableSource
+from pmutools.formats.table import LONG_COLUMNS
+from pmutools.formats.table_sink import TableSink
+
+TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
+
+
+def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
+    """Open a CSV of either layout. Raises SourceError where its header or first rows say that it is neither."""
+    text = TextTable(path)
+    header, second = text.row(), text.row()
+    if header is None:
+        raise SourceError(f"{path} is empty; name another file")
+    if second is not None:
+        if ieee_csv.is_kinds(second):
+            return ieee_csv.read_rows(text, header, second)
+        text.put_back(second)
+    names = unique(without_blank_end(header))
+    if set(LONG_COLUMNS) <= set(names):
+        raise SourceError(f"{path} is a table in long form, which cannot be played back; write it without --long")
+    if "time" not in names and "time_ns" not in names:
+        raise SourceError(f"{path}:1: no column time or time_ns; name the columns in the first row")
+    return table_source(path, "csv", names, _rows(text, names), configs=configs, defects=text.defects)
+
+
+def _rows(text: TextTable, names: list[str]) -> Iterator[Rows]:
+    place = {name: number for number, name in enumerate(names)}
+    time_column = place.get("time", place.get("time_ns", 0))
+    for columns in text.blocks(len(names)):
+        time_ns = text.times(columns[time_column])
+        good = time_ns != NO_TIME
+        if not good.all():
+            text.defects["rows without a time"] += int(np.count_nonzero(~good))
+            columns = [tuple(compress(column, good)) for column in columns]
+            time_ns = time_ns[good]
+        if len(time_ns):
+            yield _block(text, place, columns, time_ns)
+
+
+def _block(
+    text: TextTable, place: dict[str, int], columns: list[tuple[str, ...]], time_ns: npt.NDArray[np.int64]
+) -> Rows:
+    count = len(time_ns)
+
+    def values(name: str) -> npt.NDArray[np.float64] | None:
+        return text.numbers(columns[place[name]]) if name in place else None
+
+    arrivals = text.times(columns[place["arrival_ns"]]) if "arrival_ns" in place else np.full(count, NO_TIME)
+    sources = columns[place["stamp_source"]] if "stamp_source" in place else ("",) * count
+    codes = {name: stamp_code(name) for name in set(sources)}
+    stamps = np.array([codes[name] for name in sources], np.uint8)
+    frames = FrameValues(time_ns, arrivals, stamps, qualities_of(values("time_quality"), count))
+    return Rows(frames, idcodes_of(values("idcode"), count), values)
+
+
+class CsvRows:
+    """Writes each record batch at once, its header before the first."""
+
+    def __init__(self, file: OutputFile, schema: Any) -> None:
+        import pyarrow as pa
+        from pyarrow import csv as arrow_csv
+
+        fields = [pa.field("time", pa.string()), *list(schema)[1:]]
+        self._schema = pa.schema([pa.field(f.name, _plain(f.type)) for f in fields])
+        header = io.StringIO()
+        csv.writer(header, lineterminator="\n").writerow(self._schema.names)
+        file.write(header.getvalue().encode())
+        quoting = "needed" if "station" in self._schema.names else "none"  # names may hold commas
+        options = arrow_csv.WriteOptions(include_header=False, quoting_style=quoting)
+        self._file: Any = arrow_csv.CSVWriter(file, self._schema, write_options=options)
+
+    def write(self, rows: Any) -> None:
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        def plain(column: Any) -> Any:
+            if pa.types.is_floating(column.type):
+                return pc.if_else(pc.is_nan(column), pa.scalar(None, column.type), column)
+            return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+
+        time, *others = rows.columns
+        stamps = pc.strftime(time.cast(pa.timestamp("ns")), TIME_FORMAT)
+        self._file.write_batch(pa.RecordBatch.from_arrays([stamps, *map(plain, others)], schema=self._schema))
+
+    def flush(self) -> None:
+        """Nothing is held back here."""
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _plain(kind: Any) -> Any:
+    import pyarrow as pa
+
+    return pa.string() if pa.types.is_dictionary(kind) else kind
+
+
+def create(path: Path, options: SinkOptions) -> TableSink:
+    compression = path.suffix if path.suffix.lower() in (".gz", ".zst") else ""
+    return TableSink(path, f".csv{compression}", CsvRows, options)
