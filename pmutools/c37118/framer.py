@@ -132,7 +132,9 @@ class Framer:
             if reason is None:
                 self._close_run(out)
                 frame = buffer[at : at + size] if size < end else buffer
-                out.append(Frame(frame, arrival_ns, stamp_source, self._offset + at))
+                batched = self.streaming and at + size < end and stamp_source is StampSource.KERNEL
+                source = StampSource.KERNEL_BATCHED if batched else stamp_source  # the stamp is the read's last byte's
+                out.append(Frame(frame, arrival_ns, source, self._offset + at))
             elif reason is SkipReason.UNSUPPORTED:  # whole frames: each a record of its own
                 self._close_run(out)
                 out.append(Skipped(reason, self._offset + at, size))
