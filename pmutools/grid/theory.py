@@ -38,11 +38,13 @@ def closed_loop_eigenvalue(
     by Newton on (s - pole)(1 + L(s)), which is regular at the pole.
     """
     pole = mode.eigenvalue
+    if gain_mw_per_mhz == 0:
+        return pole
 
     def regular(z: complex, gain: float) -> complex:
         return (z - pole) * (1 + loop_gain(modes, z, gain, delay_s, feedback, hold_s))
 
-    s = pole + 1e-6
+    s = pole + complex(3e-4, 2e-4)  # beside the pole, where L(s) is finite
     for k in range(1, steps + 1):
         gain = gain_mw_per_mhz * k / steps
         for _ in range(30):
