@@ -11,15 +11,15 @@ from support.streams import MS, START_NS, play, samples, ticks
 from dcon.core.instance import TRANSITIONS, choose, update
 from dcon.core.params import Pair, Params, Thresholds
 from dcon.core.rows import CORE
-from dcon.core.state import Instance, Pmu, initial_state
-from dcon.core.values import InstanceState, Sample
+from dcon.core.state import Instance, Pmu, State, initial_state
+from dcon.core.values import InstanceState, Record, Sample
 
 PAIR = Params.paired(("N1",), ("S1",), nominal_kv=500.0)
 STEADY = list(samples(lambda _: 0.0, 1400))
 
 
-def states(history: list[tuple[object, object]]) -> list[InstanceState]:
-    return [record.instances[0].state for _, record in history]  # type: ignore[attr-defined]
+def states(history: list[tuple[State, Record]]) -> list[InstanceState]:
+    return [record.instances[0].state for _, record in history]
 
 
 def test_ready_after_twenty_seconds_of_valid_frames() -> None:

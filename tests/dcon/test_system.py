@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from support.streams import ARM, play, samples, ticks
 
 from dcon.core.checks import Action, Check, Scope, SystemTest
-from dcon.core.instance import Instance
 from dcon.core.params import Params
 from dcon.core.rows import CORE
-from dcon.core.state import State, initial_state
+from dcon.core.state import Instance, State, initial_state
 from dcon.core.step import step
 from dcon.core.system import ORDERS, TRANSITIONS, Trigger
 from dcon.core.values import Event, Inputs, InstanceState, Mode, Order, Record, SystemState
@@ -145,11 +145,11 @@ def test_an_unknown_order_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "inputs",
-    [None, Inputs(()), Inputs(((None,), ())), Inputs((("x",), ())), Inputs(((), ()), ("arm",)), Inputs(((), (), ()))],
+    ("samples_", "orders"),
+    [((), ()), (((None,), ()), ()), ((("x",), ()), ()), (((), ()), ("arm",)), (((), (), ()), ()), (None, None)],
 )
-def test_input_that_cannot_be_digested_is_a_fault_and_zero(inputs: Inputs) -> None:
-    state, record = step(PAIR, at(S.ACTIVE), inputs, WINDOWS[20][1])
+def test_input_that_cannot_be_digested_is_a_fault_and_zero(samples_: Any, orders: Any) -> None:
+    state, record = step(PAIR, at(S.ACTIVE), Inputs(samples_, orders), WINDOWS[20][1])
     assert record.state is state.system is S.FAULT
     assert record.command_mw == 0.0 == record.output_v
     assert [event.name for event in record.events] == ["internal_error", "fault"]
