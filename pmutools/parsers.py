@@ -25,7 +25,7 @@ Parser = Callable[[str], T]
 def suggestion(word: str, known: Iterable[str]) -> str:
     """The nearest known word, or all of them."""
     words = list(known)
-    close = get_close_matches(word, words, 1)
+    close = [known_ for known_ in words if known_.startswith(f"{word} ")] or get_close_matches(word, words, 1)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words) or 'none'}"
 
 
