@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import binascii
+import json
 import random
 from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from support.captures import PDC, REAL_CAPTURES, Endpoint, capture_path, tcp_packets, udp_packet, write_pcap
@@ -27,6 +29,8 @@ from support.wire import (
 )
 
 from pmutools.c37118.demux import Demux
+from pmutools.cli import pmu
+from pmutools.cli.shell import run
 from pmutools.flow import Chunk, Flow
 from pmutools.tools.describe import describe
 
@@ -35,9 +39,17 @@ FIRST_PORT = 20000
 DECODE_AS = (f"udp.port=={FIRST_PORT}-29999", f"tcp.port=={FIRST_PORT}-29999")
 
 
+class Generated(NamedTuple):
+    """Frames of random streams in a capture file, what they say, and what tshark says of them."""
+
+    pcap: Path
+    frames: list[bytes]
+    expected: list[Object]
+    oracle: list[Object]
+
+
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[bytes], list[Object], list[Object]]:
-    """Frames of random streams, what they say, and what tshark says of them."""
+def generated(tmp_path_factory: pytest.TempPathFactory) -> Generated:
     rng = random.Random(37118)
     frames, expected, packets = [], [], []
     for index in range(256):
@@ -49,28 +61,44 @@ def generated(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[bytes], li
         packets += [udp_packet(frame, Endpoint("192.0.2.1", FIRST_PORT + index)) for frame in mine]
         frames += mine
     pcap = write_pcap(tmp_path_factory.mktemp("oracle") / "generated.pcap", packets)
-    return frames, expected, dissect(pcap, decode_as=DECODE_AS)
+    return Generated(pcap, frames, expected, dissect(pcap, decode_as=DECODE_AS))
 
 
-def test_random_frames_say_what_tshark_reads(generated: tuple[list[bytes], list[Object], list[Object]]) -> None:
-    frames, expected, oracle = generated
-    assert len(frames) > 1000
-    assert differences(expected, oracle, ignore=["arrival_ns"]) == []
-    assert set(masked(oracle)) == {"freq-filler", "rocof-filler", "cfg3-float-scaling"}
+def dumped(pcap: Path, capsys: pytest.CaptureFixture[str]) -> list[Object]:
+    """What ``pmu dump --json`` prints."""
+    assert run(pmu(), ["dump", str(pcap), "--json"]) == 0
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
-def test_codec_reads_what_tshark_reads(generated: tuple[list[bytes], list[Object], list[Object]]) -> None:
-    frames, _, oracle = generated
+def test_random_frames_say_what_tshark_reads(generated: Generated) -> None:
+    assert len(generated.frames) > 1000
+    assert differences(generated.expected, generated.oracle, ignore=["arrival_ns"]) == []
+    assert set(masked(generated.oracle)) == {"freq-filler", "rocof-filler", "cfg3-float-scaling"}
+
+
+def test_dump_prints_what_tshark_reads_of_random_frames(
+    generated: Generated, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert differences(dumped(generated.pcap, capsys), generated.oracle) == []
+
+
+@pytest.mark.parametrize("name", REAL_CAPTURES)
+def test_dump_prints_what_tshark_reads_of_real_captures(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pcap = capture_path(name)
+    assert differences(dumped(pcap, capsys), dissect(pcap)) == []
+
+
+def test_codec_reads_what_tshark_reads(generated: Generated) -> None:
     demux = Demux()
     items = [
         item
-        for index, frame in enumerate(frames)
+        for index, frame in enumerate(generated.frames)
         for item in demux.feed(Chunk(frame, None, Flow("udp", f"192.0.2.1:{index // 5}", "192.0.2.2:4713")))
     ]
-    assert differences(map(describe, items), oracle, ignore=["arrival_ns"]) == []
+    assert differences(map(describe, items), generated.oracle, ignore=["arrival_ns"]) == []
 
 
-def test_commands_and_headers(tmp_path: Path) -> None:
+def test_commands_and_headers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     codes = (0, 1, 2, 3, 4, 5, 6, 7, 8, 0x00FF, 0x0100, 0x0FFF, 0x1000, 0xFFFF)
     frames = [command_frame(241, code) for code in codes]
     frames += [command_frame(241, 8, extended=b"\x01\x02\xff\x00"), header_frame(241, "A PMU, 50 frames/s")]
@@ -80,6 +108,7 @@ def test_commands_and_headers(tmp_path: Path) -> None:
     oracle = dissect(write_pcap(tmp_path / "commands.pcap", [udp_packet(frame) for frame in frames]))
     assert differences(expected, oracle, ignore=["arrival_ns"]) == []
     assert set(masked(oracle)) == {"command-time"}
+    assert differences(dumped(tmp_path / "commands.pcap", capsys), oracle) == []
 
 
 @pytest.mark.parametrize("name", REAL_CAPTURES)
@@ -95,7 +124,7 @@ def test_counts_of_real_captures(name: str) -> None:
     assert all(not isinstance(frame["stations"], Masked) for frame in oracle if frame["type"] == "data")
 
 
-def test_segments_split_and_coalesced_at_random(tmp_path: Path) -> None:
+def test_segments_split_and_coalesced_at_random(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(2)
     stream = random_stream(rng, formats=[6, 15], frames=40)
     octets = b"".join((stream.config(), *stream.data))
@@ -105,6 +134,7 @@ def test_segments_split_and_coalesced_at_random(tmp_path: Path) -> None:
     oracle = dissect(write_pcap(tmp_path / "segments.pcap", packets))
     expected = [stream.expected_config(), *stream.expected_data()]
     assert differences(expected, oracle, ignore=["arrival_ns"]) == []
+    assert differences(dumped(tmp_path / "segments.pcap", capsys), oracle) == []
 
 
 def test_data_without_configuration_is_not_compared(tmp_path: Path) -> None:
