@@ -1,0 +1,113 @@
+"""From a PMU's frames to what the controller sees: which channels make V1, and whether the stream fits at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dcon.core.sequence import positive_sequence
+from dcon.core.values import Sample
+from pmutools.c37118 import Frame, StreamConfig
+from pmutools.c37118.frames import Data, unpack_data
+from pmutools.c37118.layout import Layout, layout_of
+from pmutools.errors import SettingsError
+from pmutools.schema.pmu_log import PmuFrame, pmu_frame
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """Where one PMU of the controller is in its stream's frames. Made by :func:`bind`."""
+
+    name: str
+    config: StreamConfig
+    layout: Layout
+    station: int
+    voltage: tuple[int, ...]
+    """Columns of V1, or of VA, VB and VC."""
+
+    def read(self, frame: Frame) -> tuple[Sample, PmuFrame] | None:
+        """A data frame as the controller's sample and as a log entry; None where it is not of this configuration."""
+        if len(frame.data) != self.layout.frame_size:
+            return None
+        data = unpack_data(frame.data, self.config, self.layout)
+        v1 = self.v1(data)
+        sample = Sample(
+            data.time_ns,
+            data.time_ns if frame.arrival_ns is None else frame.arrival_ns,
+            v1,
+            data.frequency(self.station),
+            data.stat(self.station),
+            data.time_quality,
+            self.layout.time_base,
+        )
+        return sample, pmu_frame(self.name, frame, data, station=self.station, v1=v1)
+
+    def v1(self, data: Data) -> complex:
+        """Positive-sequence voltage, V RMS."""
+        if len(self.voltage) == 1:
+            return data.phasor(self.voltage[0])
+        return positive_sequence(*map(data.phasor, self.voltage))
+
+
+def bind(
+    name: str,
+    config: StreamConfig,
+    *,
+    rate_hz: int,
+    voltage: tuple[str, ...],
+    station: str | None = None,
+    nominal_hz: float = 60.0,
+) -> Binding:
+    """Find PMU ``name`` in a stream.
+
+    Parameters
+    ----------
+    rate_hz
+        Reporting rate that the controller runs at.
+    voltage
+        Name of the positive-sequence channel, or those of phases A, B and C.
+    station
+        Name of the station in a stream that has several.
+
+    Raises
+    ------
+    SettingsError
+        The stream's rate or nominal frequency is another, or a station or channel is not in it; says what there is.
+    """
+    if config.rate != rate_hz:
+        raise SettingsError(
+            f"PMU {name}: its stream {config.idcode} sends {float(config.rate):g} frames/s, the controller runs at "
+            f"{rate_hz}; set rate = {float(config.rate):g} for all PMUs, or the PMU to {rate_hz} frames/s"
+        )
+    index = _station(name, config, station)
+    chosen = config.stations[index]
+    if chosen.fnom_hz != nominal_hz:
+        raise SettingsError(
+            f"PMU {name}: station {chosen.name} measures a {chosen.fnom_hz:g} Hz grid, not {nominal_hz:g} Hz"
+        )
+    if len(voltage) not in (1, 3):
+        raise SettingsError(f"PMU {name}: voltage names {len(voltage)} channels; give V1, or VA,VB,VC")
+    first = layout_of(config).slots[index].phasor_columns.start
+    channels = [channel.name for channel in chosen.phasors]
+    columns = []
+    for wanted in voltage:
+        if wanted not in channels:
+            there = ", ".join(f"{c.name}" for c in chosen.phasors if c.kind == "V") or "no voltage phasors"
+            raise SettingsError(f"PMU {name}: station {chosen.name} has no channel {wanted!r}; it has {there}")
+        if chosen.phasors[channels.index(wanted)].kind != "V":
+            raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
+        columns.append(first + channels.index(wanted))
+    return Binding(name, config, layout_of(config), index, tuple(columns))
+
+
+def _station(name: str, config: StreamConfig, station: str | None) -> int:
+    names = [each.name for each in config.stations]
+    if station is None:
+        if len(names) == 1:
+            return 0
+        raise SettingsError(
+            f"PMU {name}: its stream {config.idcode} carries {len(names)} stations; pick one with "
+            f"station = {' | '.join(names)}"
+        )
+    if station not in names:
+        raise SettingsError(f"PMU {name}: stream {config.idcode} has no station {station!r}; it has {', '.join(names)}")
+    return names.index(station)
