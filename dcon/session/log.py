@@ -138,6 +138,8 @@ class LoggedTick(NamedTuple):
     pdci: Pdci | None
     after_loss: bool
     """Something of the log is missing just before this tick: a replay cannot know the controller's state."""
+    configs: tuple[tuple[str, bytes], ...] = ()
+    """Configuration frames that came since the last tick (or before the first), with the PMU's name."""
 
     def inputs(self, pmus: Sequence[str]) -> Inputs:
         """What ``step`` was given; ``pmus`` are the names in the order of its parameters."""
@@ -156,6 +158,7 @@ class TickMessages:
     after_loss: bool
     frames: list[tuple[str, Any]] = field(default_factory=list)
     messages: dict[str, list[Any]] = field(default_factory=dict)
+    configs: list[tuple[str, bytes]] = field(default_factory=list)
 
     def one(self, message: str) -> Any | None:
         """The tick's only message of that name; None where it has none."""
@@ -209,7 +212,10 @@ class SessionReader:
         self.incomplete_ticks = 0
         group: TickMessages | None = None
         losses = 0
+        configs: list[tuple[str, bytes]] = []
         for entry in self._log.records(messages):
+            if isinstance(entry, LogAttachment) and (name := config_name(entry.name)) is not None:
+                configs.append((name, entry.data))
             if not isinstance(entry, LogMessage) or (message := self._log.decode(entry)) is None:
                 continue
             if entry.channel.message == "PmuFrame" and not message.tick_ns:
@@ -217,7 +223,8 @@ class SessionReader:
             if group is None or message.tick_ns != group.tick_ns:
                 if group is not None:
                     yield group
-                group = TickMessages(message.tick_ns, after_loss=self.damage.losses > losses)
+                group = TickMessages(message.tick_ns, after_loss=self.damage.losses > losses, configs=configs)
+                configs = []
                 losses = self.damage.losses
             if entry.channel.message == "PmuFrame":
                 group.frames.append((name_of(entry.channel.topic), message))
@@ -261,4 +268,5 @@ def _logged_tick(group: TickMessages, after_loss: bool) -> LoggedTick:
         None if timing is None else Timing(timing.compute_us, timing.late_us),
         None if pdci is None else codec.decode_pdci(pdci),
         after_loss,
+        tuple(group.configs),
     )

@@ -1,0 +1,36 @@
+"""How the total delay of the loop is made up, and when the control ticks fall."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+MS = 1_000_000
+PMU_MS, NETWORK_MS, CONTROL_MS, COMMAND_MS = 44, 16, 11, 11
+"""Table I's means; together 82 ms."""
+
+
+class Delays(NamedTuple):
+    """Parts of the delay from a stamp to the effect of the command that uses it, in ns."""
+
+    arrival_ns: int
+    """Stamp to arrival: PMU and network."""
+    control_ns: int
+    """Arrival to the tick that uses the frame."""
+    command_ns: int
+
+    @property
+    def total_ns(self) -> int:
+        return self.arrival_ns + self.control_ns + self.command_ns
+
+    @property
+    def phase_ns(self) -> int:
+        """Of the ticks against the stamps: a tick comes this long after the stamp that it uses."""
+        return self.arrival_ns + self.control_ns
+
+
+def split(total_ms: float) -> Delays:
+    """Share ``total_ms`` out: the command takes up to 11 ms, the wait for the tick up to 11 ms, arrival the rest."""
+    total_ns = round(total_ms * MS)
+    command_ns = min(COMMAND_MS * MS, total_ns)
+    control_ns = min(CONTROL_MS * MS, total_ns - command_ns)
+    return Delays(total_ns - command_ns - control_ns, control_ns, command_ns)

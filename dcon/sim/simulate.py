@@ -1,0 +1,236 @@
+"""``dcon simulate``: grid, PMUs, wire, faults and controller in one process and in virtual time.
+
+Every frame exists as bytes: encoded, sent through the fault pipeline, and decoded by the controller's front end.
+Only clocks and sockets are missing. A run is a function of its plan.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dcon.core.rows import CORE
+from dcon.core.values import Event, Record
+from dcon.engine import Engine
+from dcon.session.log import SessionWriter
+from dcon.settings import Settings, parse
+from dcon.sim.delays import Delays, split
+from dcon.sim.operator import EagerOperator
+from dcon.sim.plan import START_NS, Plan, ini_of
+from pmutools import timebase
+from pmutools.c37118 import Frame
+from pmutools.flow import StampSource
+from pmutools.grid.emulate import EmulatedStream
+from pmutools.grid.grid import Grid
+from pmutools.grid.plant import build
+from pmutools.grid.pmu_model import PmuModel, fleet, measure
+from pmutools.impair.outgoing import Fate
+from pmutools.impair.pipeline import Pipeline
+from pmutools.impair.profile import Profile, parse_profile
+from pmutools.modal.matrix_pencil import ringdown
+
+MW_PER_V = 12.5
+
+
+class Estimate(NamedTuple):
+    """A mode read off a ringdown; ``r2`` is the fit's share of the variance."""
+
+    frequency_hz: float
+    damping_percent: float
+    r2: float
+
+
+@dataclass
+class Outcome:
+    """What a run gave. Columns have one entry a reporting instant (``swing_mhz``) or a tick (the others)."""
+
+    plan: Plan
+    swing_mhz: list[float] = field(default_factory=list)
+    """f_north - f_south of the grid itself, at 60/s or the plan's rate."""
+    tick_s: list[float] = field(default_factory=list)
+    delta_f_mhz: list[float] = field(default_factory=list)
+    command_mw: list[float] = field(default_factory=list)
+    events: list[tuple[float, Event]] = field(default_factory=list)
+    final_state: str = ""
+    mode: Estimate | None = None
+    open_loop: Estimate | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        plan = self.plan
+        return {
+            "scenario": plan.scenario,
+            "plant": plan.plant,
+            "gain_mw_per_mhz": plan.gain_mw_per_mhz,
+            "delay_ms": plan.delay_ms,
+            "seed": plan.seed,
+            "duration_s": plan.length_s,
+            "mode": None if self.mode is None else self.mode._asdict(),
+            "open_loop": None if self.open_loop is None else self.open_loop._asdict(),
+            "peak_command_mw": max(map(abs, self.command_mw), default=0.0),
+            "final_state": self.final_state,
+            "events": [
+                {"time_s": round(time_s, 6), "name": event.name, "subject": event.subject, "detail": event.detail}
+                for time_s, event in self.events
+            ],
+        }
+
+
+class _Sender:
+    """One emulated PMU: its frames into the fault pipeline, what comes out onto the heap of arrivals."""
+
+    def __init__(self, pmu: PmuModel, plan: Plan, profile: Profile) -> None:
+        self.pmu = pmu
+        self.stream = EmulatedStream([pmu], plan.rate_hz)
+        names = (str(pmu.idcode), pmu.bus)
+        self.pipeline = Pipeline(profile, pmu.name, plan.seed, config=self.stream.config, aliases=names)
+
+
+def settings_of(plan: Plan, pmus: Sequence[PmuModel]) -> Settings:
+    """The controller's settings for a plan, by way of the text that is logged."""
+    text = ini_of(
+        pmus,
+        gain_mw_per_mhz=plan.gain_mw_per_mhz,
+        deadband_mhz=plan.deadband_mhz,
+        rate_hz=plan.rate_hz,
+        align=plan.align,
+        interpolate_single_loss=plan.interpolate_single_loss,
+    )
+    return parse(text, f"simulation of {plan.scenario}")
+
+
+def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
+    """Run a plan, with its session logged if ``log_path`` is given, and judge its ringdown.
+
+    Raises SettingsError for what the plan names and there is not, SourceError where the log cannot be written.
+    """
+    pmus = fleet(noise_rad=plan.noise_rad, seed=plan.seed)
+    settings = settings_of(plan, pmus)
+    delays = split(plan.delay_ms)
+    base = parse_profile(f"[stream *]\ndelay = constant({delays.arrival_ns / 1e6!r})\n", "delay")
+    senders = [_Sender(pmu, plan, base.then(plan.profile)) for pmu in pmus]
+    engine = Engine(settings.params, settings.sites, verified=True)
+    configs = {}
+    for sender in senders:
+        engine.configure(sender.pmu.name, sender.stream.config)
+        configs[sender.pmu.name] = sender.stream.config_frame(START_NS)
+    outcome = Outcome(plan)
+    if log_path is None:
+        _run(plan, delays, senders, engine, outcome, None)
+    else:
+        metadata = {
+            "scenario": plan.scenario,
+            "plant": plan.plant,
+            "seed": str(plan.seed),
+            "delay_ms": repr(plan.delay_ms),
+            "verified": "true",
+        }
+        with SessionWriter(
+            log_path,
+            ini_text=settings.text,
+            configs=configs,
+            metadata=metadata,
+            pmus=[pmu.name for pmu in pmus],
+            instances=settings.params.instance_names,
+            flags=CORE.names,
+        ) as log:
+            _run(plan, delays, senders, engine, outcome, log)
+    if plan.course.ringdown_s is not None:
+        if plan.control:
+            outcome.mode = judge(outcome.swing_mhz, plan)
+        outcome.open_loop = judge(_uncontrolled(plan), plan)
+    return outcome
+
+
+def _run(
+    plan: Plan, delays: Delays, senders: Sequence[_Sender], engine: Engine, outcome: Outcome, log: SessionWriter | None
+) -> None:
+    grid = _grid(plan, delays.command_ns)
+    operator = EagerOperator()
+    arrivals: list[tuple[int, int, str, bytes]] = []
+    order = 0
+    end_ns = START_NS + round(plan.length_s * timebase.NS)
+    stamps = _stamps(plan)
+    next_stamp, slot = next(stamps), 0
+    period = timebase.NS / engine.params.tick_hz
+    for number in range(round(plan.length_s * engine.params.tick_hz)):
+        tick_ns = START_NS + delays.phase_ns + round(number * period)
+        while next_stamp <= tick_ns and next_stamp < end_ns:
+            for arrival_ns, name, data in _measure(grid, senders, next_stamp, slot, outcome):
+                heapq.heappush(arrivals, (arrival_ns, order, name, data))
+                order += 1
+            next_stamp, slot = next(stamps), slot + 1
+        frames: dict[str, list[Frame]] = {}
+        while arrivals and arrivals[0][0] <= tick_ns:
+            arrival_ns, _, name, data = heapq.heappop(arrivals)
+            frames.setdefault(name, []).append(Frame(data, arrival_ns, StampSource.CAPTURE, 0))
+        orders = operator.orders(engine.state.system) if plan.control else ()
+        tick = engine.tick(frames, orders, tick_ns)
+        grid.command(tick.record.output_v * MW_PER_V, tick_ns)
+        _note(outcome, tick.record, engine)
+        if log is not None:
+            log.tick(tick.record, tick.frames, orders)
+
+
+def _grid(plan: Plan, command_ns: int) -> Grid:
+    plant = build(plan.plant, plan.course.condition)
+    return Grid(plant, plan.course, start_ns=START_NS, command_delay_ns=command_ns, seed=plan.seed)
+
+
+def _stamps(plan: Plan) -> Iterator[int]:
+    slot = 0
+    while True:
+        yield START_NS + (slot * timebase.NS + plan.rate_hz // 2) // plan.rate_hz
+        slot += 1
+
+
+def _measure(
+    grid: Grid, senders: Sequence[_Sender], stamp_ns: int, slot: int, outcome: Outcome
+) -> Iterator[tuple[int, str, bytes]]:
+    """Move the grid to a reporting instant and send every PMU's frame: (arrival, PMU, bytes) of what gets through."""
+    grid.advance(stamp_ns)
+    buses = grid.buses()
+    outcome.swing_mhz.append((buses["north"].deviation_hz - buses["south"].deviation_hz) * 1e3)
+    for sender in senders:
+        report = measure(sender.pmu, buses, stamp_ns, slot, nominal_hz=sender.stream.nominal_hz)
+        data = sender.stream.data_frame([report])
+        for out in sender.pipeline.apply(slot, data, stamp_ns - START_NS):
+            if out.fate is Fate.SENT:
+                yield START_NS + out.offset_ns, sender.pmu.name, out.data
+
+
+def _note(outcome: Outcome, record: Record, engine: Engine) -> None:
+    time_s = (record.tick_ns - START_NS) / timebase.NS
+    outcome.tick_s.append(time_s)
+    outcome.delta_f_mhz.append(record.delta_f_mhz)
+    outcome.command_mw.append(record.command_mw)
+    outcome.events.extend((time_s, event) for event in record.events)
+    outcome.final_state = str(record.state)
+
+
+def _uncontrolled(plan: Plan) -> list[float]:
+    """The same grid left alone: its swing in mHz at the plan's rate."""
+    grid = _grid(plan, 0)
+    swing = []
+    stamps = _stamps(plan)
+    for _ in range(round(plan.length_s * plan.rate_hz)):
+        grid.advance(next(stamps))
+        buses = grid.buses()
+        swing.append((buses["north"].deviation_hz - buses["south"].deviation_hz) * 1e3)
+    return swing
+
+
+def judge(swing_mhz: Sequence[float], plan: Plan) -> Estimate | None:
+    """The strongest inter-area mode (0.1 to 1 Hz) of the plan's ringdown; None where there is none to see."""
+    window = plan.course.ringdown_s
+    if window is None:
+        return None
+    start_s, stop_s = window[0], min(window[1], len(swing_mhz) / plan.rate_hz)
+    if stop_s - start_s < 4:
+        return None
+    fit = ringdown(np.array(swing_mhz), plan.rate_hz, start_s, stop_s)
+    mode = fit.dominant()
+    return None if mode is None else Estimate(mode.frequency_hz, 100 * mode.damping, fit.r2)
