@@ -1,0 +1,5 @@
+"""``python -m dcon.cli``."""
+
+from dcon.cli import main
+
+main()

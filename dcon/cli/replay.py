@@ -1,0 +1,58 @@
+"""``dcon replay``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from pmutools.cli.shell import Exit, Talk, common
+from pmutools.errors import SourceError
+
+
+@click.command(name="replay", short_help="A recorded session through the engine again; commands must be identical.")
+@click.argument("session", metavar="SESSION")
+@click.option("--set", "changes", multiple=True, metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Commands as CSV.")
+@common
+def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: bool, quiet: bool, verbose: int) -> int:
+    """Replay a session log, tick by tick, from its logged bytes and arrivals.
+
+    Exit code 3 says that something came out otherwise (without --set), or that the log could not be replayed whole.
+    With --set the answer is what the controller would have commanded, not what the grid would have done.
+    """
+    from dcon.session.replay import replay
+
+    talk = Talk(quiet, verbose)
+    rows: list[str] = []
+    result = replay(
+        session,
+        changes,
+        None if out is None else lambda tick, now: rows.append(_row(tick.record.tick_ns, tick.record, now)),
+    )
+    if out is not None:
+        try:
+            out.write_text("tick_ns,recorded_command_mw,replayed_command_mw\n" + "".join(rows))
+        except OSError as error:
+            raise SourceError(f"--out {out}: {error.strerror}") from None
+    if as_json:
+        click.echo(json.dumps(result.to_json()))
+    elif changes:
+        click.echo(
+            f"{result.ticks} ticks with {', '.join(changes)}: commands differ by up to {result.largest_mw:.3f} MW. "
+            "This is the command, not the grid: the recorded grid answered to the recorded command."
+        )
+    elif result.different:
+        click.echo(f"{result.different} of {result.ticks} ticks differ; first: {result.first}")
+    else:
+        click.echo(f"{result.ticks} ticks: identical")
+    for problem in result.problems:
+        talk.say(problem)
+    if result.stopped:
+        talk.say(f"stopped: {result.stopped}")
+    return Exit.INCOMPLETE if result.stopped or (result.different and not changes) else Exit.DONE
+
+
+def _row(tick_ns: int, recorded: object, replayed: object) -> str:
+    return f"{tick_ns},{recorded.command_mw!r},{replayed.command_mw!r}\n"  # type: ignore[attr-defined]

@@ -1,0 +1,1 @@
+"""Where the command goes: one small module a kind of output."""
