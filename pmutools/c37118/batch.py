@@ -285,10 +285,8 @@ def _put(wire: npt.NDArray[np.void], batch: Batch, layout: Layout, run: Run) -> 
 def _put_phasors(out: npt.NDArray[Any], phasors: npt.NDArray[np.complex128], slots: Sequence[PhasorSlot]) -> int:
     factor = np.array([slot.factor for slot in slots])
     turn = np.array([slot.angle_offset_rad for slot in slots])
-    if (factor == 1).all():
-        counts = phasors
-    else:
-        counts = phasors / np.where(factor == 0, np.inf, factor)  # PHUNIT 0: the count says nothing, send 0
+    whole = np.where(factor == 0, np.inf, factor)  # PHUNIT 0: the count says nothing, send 0
+    counts = phasors if (factor == 1).all() else phasors / whole
     if turn.any():
         counts = counts * np.exp(1j * turn)
     if not slots[0].polar:

@@ -1,0 +1,58 @@
+"""Emulated PMUs on the wire: measurements of a grid as C37.118 configuration and data frames."""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Sequence
+from functools import cached_property
+
+from pmutools import timebase
+from pmutools.c37118.checksum import chk
+from pmutools.c37118.config import PhasorChannel, Station, StreamConfig, encode_config
+from pmutools.c37118.constants import Format, FrameType
+from pmutools.c37118.layout import layout_of
+from pmutools.grid.pmu_model import PHASORS, Measurement, PmuModel
+
+FORMAT = Format.FREQ_FLOAT | Format.PHASOR_FLOAT | Format.POLAR
+_CURRENT = 1 << 24
+
+
+def station_of(pmu: PmuModel, *, nominal_hz: float = 60.0) -> Station:
+    """The PMU block of an emulated PMU: VA VB VC V1 I1 as float polar, frequency as float."""
+    channels = tuple(PhasorChannel(name, _CURRENT if unit == "A" else 0) for name, unit in PHASORS)
+    return Station(pmu.name, pmu.idcode, FORMAT, channels, fnom=int(nominal_hz == 50.0))
+
+
+class EmulatedStream:
+    """One stream: a PMU, or several PMUs in the frames of one concentrator."""
+
+    def __init__(self, pmus: Sequence[PmuModel], rate: int, *, idcode: int | None = None) -> None:
+        """``rate`` in frames/s; ``idcode`` of the stream, that of the first PMU unless given."""
+        self.pmus = tuple(pmus)
+        self.nominal_hz = 50.0 if rate in (25, 50, 100) else 60.0
+        self.config = StreamConfig(
+            self.pmus[0].idcode if idcode is None else idcode,
+            tuple(station_of(pmu, nominal_hz=self.nominal_hz) for pmu in self.pmus),
+            rate,
+        )
+
+    @cached_property
+    def _pack(self) -> tuple[int, ...]:
+        return FrameType.DATA.sync, self.config.frame_size, self.config.idcode
+
+    def config_frame(self, time_ns: int) -> bytes:
+        """CFG-2, sent at ``time_ns``."""
+        soc, fracsec = timebase.from_ns(time_ns, self.config.time_base)
+        return encode_config(self.config, soc=soc, fracsec=fracsec)
+
+    def data_frame(self, measurements: Sequence[Measurement]) -> bytes:
+        """The frame of one reporting instant, one measurement a PMU."""
+        values: list[float] = []
+        for report in measurements:
+            values.append(0)
+            for phasor in (report.va, report.vb, report.vc, report.v1, report.i1):
+                values += (abs(phasor), cmath.phase(phasor))
+            values += (report.frequency_hz, report.rocof_hz_s)
+        soc, fracsec = timebase.from_ns(measurements[0].time_ns, self.config.time_base)
+        frame = layout_of(self.config).unpacker.pack(*self._pack, soc, fracsec, *values, 0)[:-2]
+        return frame + chk(frame).to_bytes(2, "big")

@@ -1,0 +1,83 @@
+"""Live streams: read from endpoints for a while, as messages, blocks and news."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.demux import Loss, Message
+from pmutools.clock import Clock, SystemClock
+from pmutools.flow import Chunk
+from pmutools.formats.source import Block, gather
+from pmutools.net.dialogue import LinkEvent
+from pmutools.net.endpoint import Endpoint, parse_endpoint
+from pmutools.net.receiver import Receivers
+
+POLL_NS = 100_000_000
+"""How often a silent reader looks at the time."""
+
+
+class LiveSource:
+    """Endpoints as a source: bound when made, read by iterating, closed by leaving the ``with``.
+
+    ``tell`` is given the news of connections. Iteration ends ``duration_s`` after the source was made, or never.
+    Raises SourceError where an endpoint cannot be opened, SettingsError for a URL that is none.
+    """
+
+    kind = "live"
+
+    def __init__(
+        self,
+        urls: Sequence[str | Endpoint],
+        *,
+        duration_s: float | None = None,
+        configs: Iterable[StreamConfig] = (),
+        tell: Callable[[LinkEvent], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        endpoints = [parse_endpoint(url) if isinstance(url, str) else url for url in urls]
+        self.path = Path(str(endpoints[0]) if len(endpoints) == 1 else f"{len(endpoints)} endpoints")
+        self.clock = clock or SystemClock()
+        self.receivers = Receivers(endpoints, self.clock, configs=configs)
+        self.tally = self.receivers.demux.tally
+        self.own_drops = 0
+        """Datagrams lost in this machine's receive buffers: not the network's doing."""
+        self._tell = tell
+        started_ns = self.clock.monotonic_ns()
+        self._end_ns = None if duration_s is None else started_ns + round(duration_s * 1e9)
+
+    def __enter__(self) -> LiveSource:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.receivers.close()
+
+    def polls(self) -> Iterator[list[Message | Loss]]:
+        """What came, poll by poll, an empty list at least every 0.1 s; the last one holds what was pending."""
+        while (left_ns := self._left_ns()) > 0:
+            found: list[Message | Loss] = []
+            for item in self.receivers.poll(min(POLL_NS, left_ns)):
+                if not isinstance(item, Chunk):
+                    self.own_drops += item.datagrams
+                    if self._tell is not None:
+                        self._tell(item)
+                found += self.receivers.parse(item)
+            yield found
+        yield self.receivers.demux.close()
+
+    def items(self) -> Iterator[Message | Loss]:
+        for found in self.polls():
+            yield from found
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        return gather(self.items())
+
+    def defects(self) -> dict[str, int]:
+        return {"datagrams lost in this machine's receive buffer": self.own_drops} if self.own_drops else {}
+
+    def _left_ns(self) -> int:
+        return POLL_NS if self._end_ns is None else self._end_ns - self.clock.monotonic_ns()
