@@ -13,16 +13,18 @@ What a data frame holds is in its configuration alone. A CFG-2 or CFG-3 dissecte
 in ``undecoded``. So does the body of a configuration whose counts lie, and any body of an unknown type.
 """
 
-from pmutools.c37118_scapy.blocks import Cfg3Station, CfgStation, DataBlock, data_blocks
+from pmutools.c37118_scapy.blocks import AnalogScaling, Cfg3Station, CfgStation, DataBlock, PhasorScaling, data_blocks
 from pmutools.c37118_scapy.layer import C37118
 from pmutools.c37118_scapy.registry import MAX_CONFIGS, config_of, forget, learn
 
 __all__ = [
     "C37118",
     "MAX_CONFIGS",
+    "AnalogScaling",
     "Cfg3Station",
     "CfgStation",
     "DataBlock",
+    "PhasorScaling",
     "config_of",
     "data_blocks",
     "forget",

@@ -16,7 +16,6 @@ from scapy.fields import (
     Field,
     FieldLenField,
     FlagsField,
-    PacketListField,
     ShortField,
     SignedIntField,
     StrFixedLenField,
@@ -31,7 +30,6 @@ from pmutools.c37118.config import Station, StreamConfig
 from pmutools.c37118.constants import (
     CHK_SIZE,
     LABELS_PER_WORD,
-    MAX_FRAME_SIZE,
     PREFIX_SIZE,
     DataError,
     Format,
@@ -39,7 +37,7 @@ from pmutools.c37118.constants import (
     TriggerReason,
 )
 from pmutools.c37118.frames import Data, StationData
-from pmutools.c37118_scapy.fields import FloatField, ItemsField, Name2Field, Name3Field, WireField, labels
+from pmutools.c37118_scapy.fields import FloatField, ItemsField, Name2Field, Name3Field, PacketsField, WireField, labels
 from pmutools.c37118_scapy.registry import MAX_CONFIGS
 
 
@@ -200,8 +198,8 @@ class Cfg3Station(_Block):
         ShortField("idcode", 1),
         StrFixedLenField("g_pmu_id", bytes(16), length=16),
         *_counts(Name3Field),
-        PacketListField("phscale", [], PhasorScaling, count_from=lambda pkt: pkt.phnmr, max_count=MAX_FRAME_SIZE),
-        PacketListField("anscale", [], AnalogScaling, count_from=lambda pkt: pkt.annmr, max_count=MAX_FRAME_SIZE),
+        PacketsField("phscale", lambda pkt, done: PhasorScaling if done < pkt.phnmr else None),
+        PacketsField("anscale", lambda pkt, done: AnalogScaling if done < pkt.annmr else None),
         ItemsField("digunit", [], XIntField("masks", 0), count_from=lambda pkt: pkt.dgnmr),
         FloatField("latitude", math.inf),
         FloatField("longitude", math.inf),

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable
 from enum import IntEnum, IntFlag
 from typing import Any
 
-from scapy.fields import BitField, Field, FieldListField, StrField, StrFixedLenField, XByteField
+from scapy.base_classes import BasePacket
+from scapy.fields import BitField, Field, FieldListField, PacketListField, StrField, StrFixedLenField, XByteField
 from scapy.packet import Packet
 from scapy.volatile import RandBin, RandFloat, RandNum, VolatileValue
 
@@ -61,6 +62,28 @@ class ItemsField(FieldListField):
 
     def randval(self) -> Any:
         return None
+
+
+class PacketsField(PacketListField):
+    """A list of packets, each of the class that ``next_class(pkt, number of packets so far)`` says, until it is None.
+
+    Scapy's own stops at 100, and turns what it cannot dissect into raw bytes up to the frame's end.
+    """
+
+    __slots__ = ["next_class"]
+
+    def __init__(self, name: str, next_class: Callable[[Packet, int], type[Packet] | None]) -> None:
+        super().__init__(name, [])
+        self.next_class = next_class
+
+    def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, list[BasePacket]]:
+        items: list[BasePacket] = []
+        while (packet_class := self.next_class(pkt, len(items))) is not None:
+            item = packet_class(s, _internal=1, _parent=pkt)
+            s = bytes(item.payload)
+            item.remove_payload()
+            items.append(item)
+        return s, items
 
 
 class Name2Field(StrFixedLenField):

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from scapy.base_classes import BasePacket
 from scapy.config import conf
 from scapy.fields import (
     BitEnumField,
     BitField,
     ConditionalField,
     FieldLenField,
-    PacketListField,
     ShortField,
     SignedShortField,
     StrLenField,
@@ -41,7 +39,7 @@ from pmutools.c37118.constants import (
 )
 from pmutools.c37118.prefix import decode_prefix
 from pmutools.c37118_scapy.blocks import Cfg3Station, CfgStation, data_block_classes
-from pmutools.c37118_scapy.fields import ReservedBitField, SyncField, labels
+from pmutools.c37118_scapy.fields import PacketsField, ReservedBitField, SyncField, labels
 from pmutools.c37118_scapy.registry import config_of, learn
 from pmutools.errors import WireError
 
@@ -57,11 +55,10 @@ def _in(*types: FrameType) -> Callable[[Packet], bool]:
     return lambda pkt: not _opaque(pkt) and pkt.type in types
 
 
-def _next_block(pkt: Packet, blocks: list[BasePacket], last: Packet | None, rest: bytes) -> type[Packet] | None:
-    """Class of the PMU block to be dissected next."""
+def _next_block(pkt: Packet, done: int) -> type[Packet] | None:
+    """Class of the PMU block that follows ``done`` others."""
     if _opaque(pkt):
         return None
-    done = len(blocks) + (last is not None)
     if pkt.type in _CONFIGS:
         station = Cfg3Station if pkt.type == FrameType.CFG3 else CfgStation
         return station if done < pkt.num_pmu else None
@@ -93,7 +90,7 @@ class C37118(Packet):
         ConditionalField(XByteField("time_base_flags", 0), _in(*_CONFIGS)),
         ConditionalField(ThreeBytesField("time_base", 1_000_000), _in(*_CONFIGS)),
         ConditionalField(FieldLenField("num_pmu", None, count_of="blocks"), _in(*_CONFIGS)),
-        PacketListField("blocks", [], next_cls_cb=_next_block, max_count=MAX_FRAME_SIZE),
+        PacketsField("blocks", _next_block),
         ConditionalField(SignedShortField("data_rate", 30), _in(*_CONFIGS)),
         ConditionalField(StrLenField("text", b"", length_from=lambda pkt: pkt.body_size), _in(FrameType.HEADER)),
         ConditionalField(XShortEnumField("cmd", Command.START_DATA, labels(Command)), _in(FrameType.COMMAND)),

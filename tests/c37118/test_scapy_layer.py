@@ -31,6 +31,7 @@ from pmutools.c37118_scapy import (
     Cfg3Station,
     CfgStation,
     DataBlock,
+    PhasorScaling,
     config_of,
     data_blocks,
     forget,
@@ -221,7 +222,7 @@ def test_a_configuration_with_its_counts_computed() -> None:
     assert [(channel.name, channel.kind) for channel in station.phasors] == [("VA", "V"), ("I1", "I")]
     assert station.digitals[0].labels[15] == "BREAKER 15"
 
-    third = Cfg3Station(stn="Δ", phasor_names=["VA"], phscale=[Cfg3Station.phscale.cls(scale=0.5, component="phase_a")])
+    third = Cfg3Station(stn="Δ", phasor_names=["VA"], phscale=[PhasorScaling(scale=0.5, component="phase_a")])
     prefix, config = decode_config(bytes(C37118(type="cfg3", blocks=[third])))
     assert (prefix.version, config.stations[0].name, config.stations[0].phasors[0].phscale.scale) == (2, "Δ", 0.5)
 
@@ -343,7 +344,7 @@ def test_fuzzed_frames_are_frames(kind: str) -> None:
     blocks = {
         "data": lambda: data_blocks(decode_config(stream.config())[1]),
         "cfg2": lambda: [CfgStation(phasor_names=["VA"], phunit=[1])],
-        "cfg3": lambda: [Cfg3Station(phasor_names=["VA"], phscale=[Cfg3Station.phscale.cls()])],
+        "cfg3": lambda: [Cfg3Station(phasor_names=["VA"], phscale=[PhasorScaling()])],
     }.get(kind, list)
     seen = set()
     for _ in range(20):
