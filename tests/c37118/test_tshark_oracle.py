@@ -7,6 +7,7 @@ import json
 import random
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -64,6 +65,12 @@ def generated(tmp_path_factory: pytest.TempPathFactory) -> Generated:
     return Generated(pcap, frames, expected, dissect(pcap, decode_as=DECODE_AS))
 
 
+@cache
+def real(name: str) -> list[Object]:
+    """tshark's reading of a real capture."""
+    return dissect(capture_path(name))
+
+
 def dumped(pcap: Path, capsys: pytest.CaptureFixture[str]) -> list[Object]:
     """What ``pmu dump --json`` prints."""
     assert run(pmu(), ["dump", str(pcap), "--json"]) == 0
@@ -84,8 +91,7 @@ def test_dump_prints_what_tshark_reads_of_random_frames(
 
 @pytest.mark.parametrize("name", REAL_CAPTURES)
 def test_dump_prints_what_tshark_reads_of_real_captures(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    pcap = capture_path(name)
-    assert differences(dumped(pcap, capsys), dissect(pcap)) == []
+    assert differences(dumped(capture_path(name), capsys), real(name)) == []
 
 
 def test_codec_reads_what_tshark_reads(generated: Generated) -> None:
@@ -114,8 +120,7 @@ def test_commands_and_headers(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize("name", REAL_CAPTURES)
 def test_counts_of_real_captures(name: str) -> None:
     """Against the numbers in the recordings' own README."""
-    oracle = dissect(capture_path(name))
-    known = REAL_CAPTURES[name]
+    oracle, known = real(name), REAL_CAPTURES[name]
     counts = Counter(frame["type"] for frame in oracle)
     assert counts == {"cfg2": known.config, "data": known.data, "command": known.command}
     assert {frame["idcode"] for frame in oracle} == {known.idcode}
