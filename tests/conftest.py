@@ -1,4 +1,4 @@
-"""Fixtures for all tests. Helpers that are imported live in ``tests/support``."""
+"""Fixtures for all tests. Code that tests import lives in ``tests/support``."""
 
 from __future__ import annotations
 
