@@ -46,7 +46,7 @@ def difference(north: Pmu, south: Pmu, align: bool) -> tuple[int, float] | None:
 def disable(last: Instance, reason: str, raised: int = 0) -> Instance:
     """``last`` after a fault: whatever was verified is lost. A disabled instance keeps its first reason."""
     if last.state is InstanceState.DISABLED and last.reason and not last.verified:
-        return last if last.raised == raised else last._replace(raised=raised)
+        return last._replace(raised=raised)
     return Instance(reason=reason, raised=raised)
 
 

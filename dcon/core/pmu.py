@@ -8,7 +8,7 @@ from operator import attrgetter
 
 from dcon.core.checks import Supervisor
 from dcon.core.differentiator import EMPTY, Filter, advance, midpoint
-from dcon.core.params import NS, RING_SIZE, Params, PmuParams
+from dcon.core.params import RING_SIZE, Params, PmuParams
 from dcon.core.stamps import is_apart
 from dcon.core.state import Pmu
 from dcon.core.values import Sample
@@ -50,14 +50,11 @@ def extend(params: Params, last: Pmu, sample: Sample, slot: int, now_ns: int) ->
 
 def bridge(params: Params, last: Pmu, sample: Sample) -> Pmu | None:
     """The run with an estimate for the one frame missing before ``sample``; None if it is not exactly one."""
-    if last.slot is None or last.filter.frames < 3:
-        return None
-    if not is_apart(last.time_ns, sample.time_ns, 2, params.rate_hz, sample.time_base):
+    if last.filter.frames < 3 or not is_apart(last.time_ns, sample.time_ns, 2, params.rate_hz, sample.time_base):
         return None
     theta = midpoint(last.filter.theta_rad, math.atan2(sample.v1.imag, sample.v1.real))
     filtered, ring = turn(params, last, theta)
-    time_ns = last.time_ns + round(NS / params.rate_hz)
-    return last._replace(slot=last.slot + 1, time_ns=time_ns, filter=filtered, ring=ring)
+    return last._replace(filter=filtered, ring=ring)  # slot and stamp come with ``sample``
 
 
 def follows(params: Params, last: Pmu, sample: Sample, slot: int) -> bool:

@@ -113,5 +113,6 @@ def test_the_newest_common_stamp() -> None:
     assert difference(south, north, align=True) == (5, (0.1 - 0.3) * 1e3)
     assert difference(north, south, align=False) == (5, (0.5 - 0.1) * 1e3)
     assert difference(north, ring(4, 0.1), align=True) is None
+    assert difference(ring(4, 0.1), ring(5, 0.2), align=True) is None
     assert difference(north, ring(5), align=True) is None
     assert difference(north, ring(None), align=True) is None

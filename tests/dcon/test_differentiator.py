@@ -178,6 +178,11 @@ def test_white_noise_gain() -> None:
     assert 20 * math.log10(ours / backward) == pytest.approx(-26.1, abs=0.05)
 
 
+def test_wrapped_angles_end_at_plus_pi() -> None:
+    assert wrap(math.pi) == math.pi == wrap(-math.pi)
+    assert wrap(math.nextafter(math.pi, 4)) < -3.1 and wrap(-3.1) == -3.1
+
+
 @given(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5))
 def test_midpoint_goes_the_short_way(before: float, step: float) -> None:
     after = wrap(wrap(before) + step)

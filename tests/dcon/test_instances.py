@@ -53,6 +53,15 @@ def test_a_window_without_frames_holds() -> None:
     assert InstanceState.DISABLED not in states(history)[20:]
 
 
+def test_the_first_reason_stands_until_the_instance_comes_back() -> None:
+    params = Params.paired(("N1",), ("S1",), init_s=0.5)
+    bad = [frame._replace(stat=0x8000 * (90 <= k < 95 or k == 200)) for k, frame in enumerate(STEADY[:300])]
+    stopped = [*bad[:60], *bad[90:]]
+    reasons = [record.instances[0].reason for _, record in play(params, ticks((stopped, STEADY[:300]), 290))]
+    assert list(dict.fromkeys(reasons)) == ["", "N1: arrival_gap", "N1: stat_error"]
+    assert reasons[95:200] == ["N1: arrival_gap"] * 105
+
+
 def fresh(slot: int, f: float = 0.0, **fields: object) -> Pmu:
     time_ns = START_NS + round(slot * 1e9 / 60)
     base = START_NS // 1_000_000_000 * 60

@@ -137,6 +137,7 @@ def turned(frame: Sample, degrees: float = 0.0, scale: float = 1.0) -> Sample:
         (changed(time_quality=0x70), []),
         (changed(arrival_ns=GOOD[20].time_ns + 90 * MS), []),
         (changed(arrival_ns=GOOD[20].time_ns + 91 * MS), ["latency_high"]),
+        (changed(arrival_ns=GOOD[20].time_ns + 200 * MS), ["latency_high"]),
         (changed(arrival_ns=GOOD[20].time_ns + 201 * MS), ["latency_high", "latency"]),
         (changed(arrival_ns=GOOD[20].time_ns - 5 * MS), []),
         (changed(arrival_ns=GOOD[20].time_ns - 6 * MS), ["latency"]),
@@ -159,6 +160,11 @@ def test_what_each_check_sees_in_one_frame(frame: Sample, want: list[str]) -> No
 def test_frequency_bound(hz: float, want: list[str]) -> None:
     pmu = feed(list(samples(lambda _: hz, 3)))
     assert flags(pmu) == want
+
+
+def test_a_voltage_step_shows_from_the_second_frame_of_a_run() -> None:
+    assert flags(feed([GOOD[0], turned(GOOD[1], scale=1.15)])) == ["voltage_step"]
+    assert flags(feed([turned(GOOD[0], scale=1.15)])) == []
 
 
 def test_flags_of_frames_stay_up_while_nothing_comes() -> None:

@@ -139,6 +139,24 @@ def test_gain_ramps_and_is_bounded() -> None:
     assert max(steps) < 0.3 and records[-1].command_mw == pytest.approx(60.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("gain", [0.0, 15.0])
+def test_the_ends_of_the_gain_range_are_allowed(gain: float) -> None:
+    assert tick(READY, Order("gain", gain))[0].target_gain_mw_per_mhz == gain
+
+
+def test_the_record_tells_what_the_tick_saw() -> None:
+    _, record = tick(at(S.ACTIVE))
+    assert record.f_hz == pytest.approx((60.005, 60.0), abs=1e-6)
+    assert record.age_ms == pytest.approx((70.667, 70.667), abs=1e-3)  # 60 ms to arrive, then the next tick
+    assert record.delta_f_mhz == record.instances[0].delta_f_mhz == pytest.approx(5.0, abs=1e-3)
+    assert record.active == 0 and record.instances[0].active
+    assert (record.gain_mw_per_mhz, record.probe_mw, record.flags) == (9.0, 0.0, 0)
+    _, record = step(PAIR, initial_state(PAIR), Inputs(((), ())), WINDOWS[0][1])
+    assert all(map(math.isnan, (*record.f_hz, *record.age_ms, record.delta_f_mhz)))
+    assert record.active is None and not record.instances[0].active
+    assert CORE.named(record.flags) == ["no_data", "no_ready_instance"]
+
+
 def test_an_unknown_order_is_refused() -> None:
     _, record = tick(READY, Order("launch"))
     assert record.events == (Event("refused", "launch", "no such order"),)
