@@ -92,7 +92,7 @@ def slots_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[n
 
 def grid_offset_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
     """Signed distance in ns of each stamp (N,) from its nearest reporting instant, at a rate as in slots_array."""
-    soc, frac_ns = np.divmod(time_ns, NS)
+    frac_ns = np.mod(time_ns, NS)
     offset: npt.NDArray[np.int64]
     if rate.denominator == 1:
         nearest = (frac_ns * rate.numerator + NS // 2) // NS

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
+
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
 from pmutools import timebase
+from pmutools.c37118.config import Station
 from pmutools.c37118.constants import Format
 from pmutools.tools.inventory import Inventory, StreamInventory
 
@@ -48,20 +51,21 @@ def _stream(console: Console, stream: StreamInventory) -> None:
         console.print(f"  {timebase.format_utc(stream.last_ns)}")
     for text in remarks(stream):
         console.print(f"  [yellow]*[/] {text}")
-    table = Table(box=None, pad_edge=True, header_style="dim")
-    for heading in ("station", "IDCODE", "FORMAT", "Hz", "phasors", "analogs", "digital words"):
-        table.add_column(heading)
     for station in config.stations:
-        table.add_row(
-            station.name,
-            str(station.idcode),
-            format_text(station.format),
-            f"{station.fnom_hz:g}",
-            _names([channel.name for channel in station.phasors]),
-            _names([channel.name for channel in station.analogs]),
-            str(len(station.digitals)),
-        )
-    console.print(table)
+        _station(console, station)
+
+
+def _station(console: Console, station: Station) -> None:
+    facts = f"IDCODE {station.idcode}, {station.fnom_hz:g} Hz, {format_text(station.format)}"
+    console.print(f"  [bold]{escape(station.name)}[/]  {facts}")
+    names = [
+        _names("phasors", [f"{channel.name} ({channel.kind})" for channel in station.phasors]),
+        _names("analogs", [channel.name for channel in station.analogs]),
+        f"{len(station.digitals)} digital words" if station.digitals else "",
+    ]
+    text = "; ".join(filter(None, names)) or "no channels but frequency and ROCOF"
+    for line in textwrap.wrap(text, 92):
+        console.print(f"    {line}", markup=False)
 
 
 def format_text(fmt: Format) -> str:
@@ -94,6 +98,8 @@ def remarks(stream: StreamInventory) -> list[str]:
     return texts
 
 
-def _names(names: list[str]) -> str:
-    shown = " ".join(names[:CHANNELS_SHOWN])
-    return shown + (f" and {len(names) - CHANNELS_SHOWN} more" if len(names) > CHANNELS_SHOWN else "") if names else "-"
+def _names(what: str, names: list[str]) -> str:
+    if not names:
+        return ""
+    more = f", and {len(names) - CHANNELS_SHOWN} more" if len(names) > CHANNELS_SHOWN else ""
+    return f"{len(names)} {what}: {', '.join(names[:CHANNELS_SHOWN])}{more}"

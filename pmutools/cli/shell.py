@@ -72,12 +72,26 @@ class Talk:
 
     def __init__(self, quiet: bool, verbose: int) -> None:
         self.quiet = quiet
+        self._shown = False
         level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
         logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
 
     def say(self, text: str) -> None:
         if not self.quiet:
+            self._clear()
             click.echo(text, err=True)
+
+    def progress(self, text: str) -> None:
+        """A line that the next one overwrites; only where a person is watching."""
+        if not self.quiet and sys.stderr.isatty():
+            self._clear()
+            click.echo(text, err=True, nl=False)
+            self._shown = True
+
+    def _clear(self) -> None:
+        if self._shown:
+            click.echo("\r\x1b[K", err=True, nl=False)
+            self._shown = False
 
 
 def run(command: click.Command, arguments: Sequence[str], *, name: str | None = None) -> int:

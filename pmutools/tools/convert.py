@@ -56,6 +56,13 @@ def convert(sources: Sequence[Source], sink: Sink, window: Window) -> Conversion
     return result
 
 
+def merged(paths: Sequence[str]) -> Iterator[Message | Loss]:
+    """Every frame of several recordings, merged on time."""
+    from pmutools.formats import open_source
+
+    return _merge_items([open_source(path) for path in paths])
+
+
 def _merge_items(sources: Sequence[Source]) -> Iterator[Message | Loss]:
     if len(sources) == 1:
         return sources[0].items()

@@ -1,0 +1,64 @@
+"""``pmu read``."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.sources import DURATION
+
+
+@click.command(name="read", short_help="Read live streams and log them.")
+@click.argument("urls", nargs=-1, required=True, metavar="URL...")
+@click.option("--out", required=True, metavar="FILE", help="Format by suffix; - is CSV to stdout.")
+@click.option("--phasors", type=click.Choice(("polar", "rect")), default="polar", show_default=True)
+@click.option("--long", "long_form", is_flag=True, help="Tables in long form, all streams in one file.")
+@DURATION
+@common
+def command(
+    urls: tuple[str, ...],
+    out: str,
+    phasors: str,
+    long_form: bool,
+    duration: float | None,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> int:
+    """Read streams from URLs (udp://, tcp://, udp+cmd://, tcp+udp://) into a file, until Ctrl-C or --duration.
+
+    Several streams are written side by side into a folder named as the file, without suffix.
+    Exit code 3 says that bytes came that are no frames, or that this machine could not keep up.
+    """
+    from pmutools.errors import SourceError
+    from pmutools.net.dialogue import LinkEvent, LinkKind
+    from pmutools.tools.live import LiveSource
+
+    talk = Talk(quiet, verbose)
+    warnings = frozenset(LinkKind) - {LinkKind.BOUND, LinkKind.CONNECTED, LinkKind.CONFIGURED, LinkKind.STREAMING}
+
+    def tell(event: LinkEvent) -> None:
+        if verbose or event.kind in warnings:
+            detail = event.detail.removeprefix(f"{event.where}: ")
+            talk.say(f"{event.where}: {event.kind}" + (f": {detail}" if detail else ""))
+
+    with LiveSource(urls, duration_s=duration, tell=tell) as source:  # bound before anything slow is imported
+        from pmutools.formats import open_sink
+        from pmutools.tools.reader import Reading, read
+
+        reading: Reading | None = None
+        with open_sink(out, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
+            reading = read(source, sink, lambda now: talk.progress(f"{now.frames} frames, {len(now.streams)} streams"))
+    paths = [str(path) for path in sink.paths]
+    if as_json and out != "-":
+        click.echo(json.dumps(reading.to_json() | {"paths": paths}))
+    talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {', '.join(paths)}")
+    for reason, nbytes in reading.tally.skipped.items():
+        talk.say(f"  {nbytes} bytes skipped: {reason}")
+    if reading.own_drops:
+        talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
+    if not reading.frames and not reading.tally.skipped:
+        raise SourceError(f"no data came from {', '.join(urls)}; is the sender on, and the port and IDCODE right?")
+    return Exit.INCOMPLETE if reading.tally.skipped or reading.own_drops else Exit.DONE
