@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pmutools.c37118.config import StreamConfig
-from pmutools.errors import SourceError
 from pmutools.formats.files import OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource
-from pmutools.formats.table import arrow_source
+from pmutools.formats.table import arrow_source, reading
 from pmutools.formats.table_sink import TableSink
 
 MAGIC = b"ARROW1"
@@ -25,30 +24,19 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
     import pyarrow as pa
 
     defects = Counter[str]()
-    try:
+    with reading(path, "Arrow"):
         file = pa.OSFile(str(path))
-        if file.read(len(MAGIC)) == MAGIC:
-            file.seek(_FRAME)
-        else:
-            file.seek(0)
+        file.seek(_FRAME if file.read(len(MAGIC)) == MAGIC else 0)
         stream = pa.ipc.open_stream(file)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
-    def parts() -> Iterator[Any]:
-        try:
-            yield from stream
-        except (OSError, pa.ArrowException):
-            defects["table without an end"] = 1
-        finally:
-            file.close()
+        def parts() -> Iterator[Any]:
+            with file:
+                try:
+                    yield from stream
+                except (OSError, ValueError, pa.ArrowException):
+                    defects["table without an end"] = 1
 
-    return arrow_source(path, "arrow", stream.schema, parts(), configs, defects)
-
-
-def _unreadable(path: Path, error: Exception) -> SourceError:
-    reason = str(error).partition("\n")[0].rstrip(".")
-    return SourceError(f"{path} is no readable Arrow file ({reason}); name another file")
+        return arrow_source(path, "arrow", stream.schema, parts(), configs, defects)
 
 
 class ArrowRows:

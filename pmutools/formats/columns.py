@@ -156,11 +156,13 @@ def batch_of(
     columns: Iterable[Column],
     frames: FrameValues,
     values: Callable[[str], npt.NDArray[Any] | None],
+    *,
+    exact: bool,
 ) -> Batch:
     """A batch of ``config`` from a file's columns: ``values`` gives N numbers by column name, None where it has none.
 
     What is missing is NaN; a missing or NaN STAT is 0, or says absent where the station has nothing in that row.
-    Polar stations given by polar columns get their ``wire`` at once, for the values that only the columns hold.
+    With ``exact``, polar stations given by polar columns get their ``wire`` at once, for what only the columns hold.
     """
     count, layout = len(frames.time_ns), layout_of(config)
     stations, phasors = len(layout.slots), len(layout.phasors)
@@ -194,7 +196,7 @@ def batch_of(
         _words(np.nan_to_num(found["digital"])),
         valid & ((stat_words & STAT_DATA_ERROR_MASK) == 0),
     )
-    return _with_polar_wire(batch, found["mag"], found["deg"]) if polar else batch
+    return _with_polar_wire(batch, found["mag"], found["deg"]) if polar and exact else batch
 
 
 def _words(values: Floats) -> npt.NDArray[np.uint16]:
@@ -236,7 +238,7 @@ def _with_polar_wire(batch: Batch, magnitude: Floats, degrees: Floats) -> Batch:
         raw, sizes, angles = wire[name]["phasors"], magnitude[:, columns], degrees[:, columns]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             counts = sizes / np.where(factors == 0, np.inf, factors)
-            turned = np.radians(angles) + turns
+            turned = np.radians(angles) + turns if turns.any() else np.radians(angles)  # adding 0 would lose -0
             if raw.dtype.names:
                 given = ~np.isnan(sizes) & ~np.isnan(angles)
                 angle_counts = np.clip(np.rint(turned / RAD_PER_COUNT), INT16_FILLER + 1, -INT16_FILLER - 1)

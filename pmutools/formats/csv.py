@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator
+from functools import cache
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -52,9 +53,9 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
 
 def _rows(text: TextTable, names: list[str]) -> Iterator[Rows]:
     place = {name: number for number, name in enumerate(names)}
-    time_column = place.get("time", place.get("time_ns", 0))
-    for columns in text.blocks(len(names)):
-        time_ns = text.times(columns[time_column])
+    times, time_column = (text.times, "time") if "time" in place else (text.nanoseconds, "time_ns")
+    for columns in text.blocks(len(names), fill=False):
+        time_ns = times(columns[place[time_column]])
         good = time_ns != NO_TIME
         if not good.all():
             text.defects["rows without a time"] += int(np.count_nonzero(~good))
@@ -69,10 +70,11 @@ def _block(
 ) -> Rows:
     count = len(time_ns)
 
+    @cache
     def values(name: str) -> npt.NDArray[np.float64] | None:
         return text.numbers(columns[place[name]]) if name in place else None
 
-    arrivals = text.times(columns[place["arrival_ns"]]) if "arrival_ns" in place else np.full(count, NO_TIME)
+    arrivals = text.nanoseconds(columns[place["arrival_ns"]]) if "arrival_ns" in place else np.full(count, NO_TIME)
     sources = columns[place["stamp_source"]] if "stamp_source" in place else ("",) * count
     codes = {name: stamp_code(name) for name in set(sources)}
     stamps = np.array([codes[name] for name in sources], np.uint8)

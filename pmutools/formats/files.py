@@ -8,7 +8,7 @@ import io
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -38,10 +38,16 @@ class OutputFile(io.RawIOBase):
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
+        self._moves_to: Path | None = None
         self._at = 0
         with self._failing():
             self._raw: IO[bytes] = sys.stdout.buffer if path == STDOUT else path.open("wb")
             self._out = _compressed(self._raw, path.suffix.lower())
+
+    @property
+    def final_path(self) -> Path:
+        """Where the file is once it is closed."""
+        return self._moves_to or self.path
 
     def writable(self) -> bool:
         return True
@@ -77,12 +83,18 @@ class OutputFile(io.RawIOBase):
                 finally:
                     if self.path != STDOUT:
                         self._raw.close()
+                if self._moves_to is not None:
+                    os.replace(self.path, self._moves_to)
+                    self.path = self._moves_to
 
     def move(self, path: Path) -> None:
-        """Give the file another name; it may go on being written."""
+        """Give the file, which goes on being written, another name; where the system refuses that, at the end."""
         with self._failing():
-            os.replace(self.path, path)
-            self.path = path
+            try:
+                os.replace(self.path, path)
+                self.path = path
+            except PermissionError:  # Windows, while the file is open
+                self._moves_to = path
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -167,13 +179,18 @@ class TextTable:
         """Have :meth:`row` give ``row`` again."""
         self._again.append(row)
 
-    def blocks(self, width: int) -> Iterator[list[tuple[str, ...]]]:
-        """The rows left, as lists of ``width`` columns; shorter and longer rows are counted, filled and cut."""
+    def blocks(self, width: int, *, fill: bool) -> Iterator[list[tuple[str, ...]]]:
+        """The rows left, as lists of ``width`` columns; rows of another length are counted.
+
+        Longer rows lose what is beyond; shorter ones are filled with blanks or (``fill`` false) left out, as what a
+        writer that was killed had not finished.
+        """
         rows: list[list[str]] = []
         while (row := self.row()) is not None:
             if any(row[width:]) or len(row) < width:
                 self.defects["ragged rows"] += 1
-            rows.append(row[:width] + [""] * (width - len(row)))
+            if fill or len(row) >= width:
+                rows.append(row[:width] + [""] * (width - len(row)))
             if len(rows) >= TEXT_ROWS:
                 yield list(zip(*rows, strict=True))
                 rows = []
@@ -195,8 +212,12 @@ class TextTable:
             return _NAN
 
     def times(self, cells: Sequence[str]) -> npt.NDArray[np.int64]:
-        """(N,) ns of cells that hold ISO-8601 times or whole nanoseconds; NO_TIME for others, which are not counted."""
-        return np.array([_time(cell) for cell in cells], np.int64)
+        """(N,) ns of ISO-8601 times; NO_TIME for cells that hold none, which are not counted."""
+        return np.array([_checked(parse_utc, cell) for cell in cells], np.int64)
+
+    def nanoseconds(self, cells: Sequence[str]) -> npt.NDArray[np.int64]:
+        """(N,) whole ns; NO_TIME for cells that hold none, which are not counted."""
+        return np.array([_checked(int, cell) for cell in cells], np.int64)
 
 
 def without_blank_end(row: Sequence[str]) -> list[str]:
@@ -204,9 +225,9 @@ def without_blank_end(row: Sequence[str]) -> list[str]:
     return list(row[: max((number for number, cell in enumerate(row, 1) if cell), default=0)])
 
 
-def _time(cell: str) -> int:
+def _checked(read: Callable[[str], int], cell: str) -> int:
     try:
-        time_ns = parse_utc(cell) if "-" in cell[1:] else int(cell)
+        time_ns = read(cell)
     except ValueError:
         return NO_TIME
     return time_ns if 0 <= time_ns < END_NS else NO_TIME

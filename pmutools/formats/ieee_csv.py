@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from itertools import chain, compress
 from typing import NamedTuple
 
@@ -96,7 +97,7 @@ def read_rows(text: TextTable, names: Sequence[str], kinds: Sequence[str]) -> Ta
     units: Sequence[str] = ()
     labels: Sequence[str] = ()
     for row in iter(text.row, None):
-        if all(map(_is_number, row)) or len(labels):
+        if labels or not _is_header(row):
             text.put_back(row)
             break
         if not units and re.fullmatch(r"s|secs?|seconds?", row[0], re.IGNORECASE):
@@ -122,6 +123,12 @@ def read_rows(text: TextTable, names: Sequence[str], kinds: Sequence[str]) -> Ta
     except SourceError as error:
         raise SourceError(f"{text.path}: {error}") from None
     return planned_source(text.path, "ieee-csv", plan, chain([first], walk), text.defects)
+
+
+def _is_header(row: Sequence[str]) -> bool:
+    """Whether a row holds words, or nothing but a date; a row of numbers may begin with a date."""
+    others = [cell for cell in row[1:] if cell]
+    return not all(map(_is_number, others)) or not (others or _is_number(row[0]))
 
 
 def _is_number(cell: str) -> bool:
@@ -226,7 +233,7 @@ class _Rows:
         self._offsets: dict[int, float] = {}
 
     def __iter__(self) -> Iterator[Rows]:
-        for columns in self._text.blocks(self._width):
+        for columns in self._text.blocks(self._width, fill=True):
             time_ns = np.array([self._time(cell) for cell in columns[0]], np.int64)
             good = time_ns != NO_TIME
             if not good.all():
@@ -252,9 +259,12 @@ class _Rows:
     def _block(self, columns: list[tuple[str, ...]], time_ns: npt.NDArray[np.int64]) -> Rows:
         count = len(time_ns)
 
+        @cache
+        def scaled(number: int) -> npt.NDArray[np.float64]:
+            return self._text.numbers(columns[number]) * self._heads[str(number)].scale
+
         def values(name: str) -> npt.NDArray[np.float64] | None:
-            head = self._heads[name]
-            return self._text.numbers(columns[head.number]) * head.scale + self._offsets.get(head.number, 0.0)
+            return scaled(int(name)) + self._offsets.get(int(name), 0.0)
 
         stamps = np.full(count, stamp_code(None), np.uint8)
         frames = FrameValues(time_ns, np.full(count, NO_TIME), stamps, np.zeros(count, np.uint8))

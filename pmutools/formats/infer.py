@@ -31,11 +31,15 @@ _POLAR = ("mag", "deg")
 _WORD = re.compile(r"WORD\d+")
 
 
-class Inferred(NamedTuple):
-    """A configuration, and where in its batches each column of the file belongs."""
+class Plan(NamedTuple):
+    """A configuration, and where in its batches each column of the file belongs.
+
+    ``exact`` says that the values were once frames of this configuration, whose bytes are to come back.
+    """
 
     config: StreamConfig
     columns: tuple[Column, ...]
+    exact: bool
 
 
 # --- names of columns -> what they are --------------------------------------------------------------------------
@@ -79,7 +83,7 @@ def _split(name: str, stations: Iterable[str], title: str) -> tuple[str, str]:
 # --- what the columns are -> configuration ----------------------------------------------------------------------
 
 
-def infer(columns: Sequence[Column], *, idcode: int, data_rate: int, fnom_hz: float) -> Inferred:
+def infer(columns: Sequence[Column], *, idcode: int, data_rate: int, fnom_hz: float) -> Plan:
     """The configuration of a stream with these columns, whose ``at`` is filled in.
 
     Stations and channels come in the order of their first columns. Raises SourceError for more than a data frame
@@ -109,7 +113,7 @@ def infer(columns: Sequence[Column], *, idcode: int, data_rate: int, fnom_hz: fl
     config = StreamConfig(idcode, tuple(stations), data_rate)
     if config.frame_size > MAX_FRAME_SIZE:
         raise SourceError(f"{len(columns)} columns make data frames of {config.frame_size} bytes; leave some out")
-    return Inferred(config, tuple(placed))
+    return Plan(config, tuple(placed), exact=False)
 
 
 def _group(column: Column) -> str | None:
@@ -159,12 +163,13 @@ def wire_names(names: Iterable[str]) -> list[str]:
 def data_rate_of(time_ns: npt.NDArray[np.int64]) -> int | None:
     """DATA_RATE of stamps (N,): > 0 frames/s, < 0 seconds a frame; None where fewer than two tell nothing.
 
-    The median spacing counts, so gaps and single odd stamps do not matter.
+    The mean of spacings near their median counts, so neither gaps nor rounded stamps matter.
     """
     steps = np.diff(np.unique(time_ns))
     if not len(steps):
         return None
-    period_s = float(np.median(steps)) / NS
+    usual = np.median(steps)
+    period_s = float(steps[np.abs(steps - usual) <= usual / 2].mean()) / NS
     if period_s > 1.5:
         return -min(round(period_s), 0x7FFF)
     rate = 1 / period_s

@@ -6,17 +6,15 @@ A Parquet file can be read only when its footer is there: one whose writer was k
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pmutools.c37118.config import StreamConfig
-from pmutools.errors import SourceError
 from pmutools.formats.files import OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import BLOCK_FRAMES, TableSource
-from pmutools.formats.table import arrow_source
+from pmutools.formats.table import arrow_source, reading
 from pmutools.formats.table_sink import TableSink
 from pmutools.timebase import NS
 
@@ -29,28 +27,16 @@ _MIN_ROWS = 1 << 12
 
 def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
     """Open a table; memory is bounded by one of its row groups."""
-    import pyarrow as pa
     from pyarrow import parquet
 
-    try:
+    with reading(path, "Parquet"):
         file = parquet.ParquetFile(path)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
 
-    def parts() -> Iterator[Any]:
-        try:
-            yield from file.iter_batches(BLOCK_FRAMES)
-        except (OSError, pa.ArrowException) as error:
-            raise _unreadable(path, error) from None
-        finally:
-            file.close()
+        def parts() -> Iterator[Any]:
+            with reading(path, "Parquet"), file:
+                yield from file.iter_batches(BLOCK_FRAMES)
 
-    return arrow_source(path, "parquet", file.schema_arrow, parts(), configs, Counter())
-
-
-def _unreadable(path: Path, error: Exception) -> SourceError:
-    reason = str(error).partition("\n")[0].rstrip(".")
-    return SourceError(f"{path} is no readable Parquet file ({reason}); was its writer killed before the end?")
+        return arrow_source(path, "parquet", file.schema_arrow, parts(), configs)
 
 
 class ParquetRows:
@@ -61,7 +47,7 @@ class ParquetRows:
         from pyarrow import parquet
 
         floats = [field.name for field in schema if pa.types.is_floating(field.type)]
-        texts = [field.name for field in schema if pa.types.is_dictionary(field.type)]
+        texts = [f.name for f in schema if pa.types.is_dictionary(f.type) or pa.types.is_string(f.type)]
         self._schema = schema
         self._file: Any = parquet.ParquetWriter(
             file, schema, compression="zstd", use_dictionary=texts, use_byte_stream_split=floats

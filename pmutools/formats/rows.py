@@ -16,8 +16,8 @@ from pmutools.c37118.batch import STAMP_SOURCES, Batch
 from pmutools.c37118.config import StreamConfig
 from pmutools.errors import SourceError
 from pmutools.flow import Flow, StampSource
-from pmutools.formats.columns import Column, FrameValues, Phasors, batch_of, columns_of
-from pmutools.formats.infer import Inferred, columns_from_names, data_rate_of, infer, nominal_hz_of
+from pmutools.formats.columns import FrameValues, Phasors, batch_of, columns_of
+from pmutools.formats.infer import Plan, columns_from_names, data_rate_of, infer, nominal_hz_of
 from pmutools.formats.source import Block, TableSource
 
 NO_IDCODE = 1
@@ -50,7 +50,8 @@ def table_source(
     walk = iter(rows)
     first = next(walk, None)
     if first is None:
-        raise SourceError(f"{path} holds no rows of measurements; name another file")
+        found = ", ".join(f"{name}: {count}" for name, count in (defects or {}).items())
+        raise SourceError(f"{path} holds no rows of measurements{found and f' ({found})'}; name another file")
     plan = _known(names, [own] if own else []) or _known(
         names, [config for config in configs if config.idcode == int(first.idcode[0])]
     )
@@ -62,25 +63,25 @@ def table_source(
 
 
 def planned_source(
-    path: Path, kind: str, plan: Inferred, rows: Iterable[Rows], defects: Counter[str] | None = None
+    path: Path, kind: str, plan: Plan, rows: Iterable[Rows], defects: Counter[str] | None = None
 ) -> TableSource:
     """A source of rows whose configuration is decided."""
     counts = Counter[str]() if defects is None else defects
     return TableSource(path, kind, _blocks(plan, rows, Flow("file", path.name)), lambda: dict(+counts))
 
 
-def _known(names: Sequence[str], configs: Iterable[StreamConfig]) -> Inferred | None:
+def _known(names: Sequence[str], configs: Iterable[StreamConfig]) -> Plan | None:
     """The first configuration whose columns the file has; a file may lack some of them, and is read all the same."""
     present = set(names)
     for config in configs:
         styles = [columns_of(config, style) for style in _STYLES]
         best = max(styles, key=lambda columns: sum(column.name in present for column in columns))
         if any(column.name in present for column in best):
-            return Inferred(config, best)
+            return Plan(config, best, exact=True)
     return None
 
 
-def _inferred(names: Sequence[str], first: Rows, path: Path) -> Inferred:
+def _inferred(names: Sequence[str], first: Rows, path: Path) -> Plan:
     columns = columns_from_names(names, path.name.partition(".")[0])
     rate = data_rate_of(first.frames.time_ns)
     frequencies = [first.values(column.name) for column in columns if column.quantity == "freq_hz"]
@@ -89,7 +90,7 @@ def _inferred(names: Sequence[str], first: Rows, path: Path) -> Inferred:
     return infer(columns, idcode=int(first.idcode[0]), data_rate=rate or round(fnom_hz), fnom_hz=fnom_hz)
 
 
-def _blocks(plan: Inferred, rows: Iterable[Rows], flow: Flow) -> Iterator[Block]:
+def _blocks(plan: Plan, rows: Iterable[Rows], flow: Flow) -> Iterator[Block]:
     """One block for each run of rows; several where the rows have several IDCODEs."""
     configs: dict[int, StreamConfig] = {plan.config.idcode: plan.config}
     for part in rows:
@@ -97,12 +98,14 @@ def _blocks(plan: Inferred, rows: Iterable[Rows], flow: Flow) -> Iterator[Block]
             if idcode not in configs:
                 configs[idcode] = replace(plan.config, idcode=idcode)
             chosen = part.idcode == idcode
-            yield Block(flow, _batch(configs[idcode], plan.columns, part, None if chosen.all() else chosen))
+            here = plan._replace(config=configs[idcode])
+            yield Block(flow, _batch(here, part, None if chosen.all() else chosen))
 
 
-def _batch(config: StreamConfig, columns: Sequence[Column], rows: Rows, chosen: npt.NDArray[np.bool_] | None) -> Batch:
+def _batch(plan: Plan, rows: Rows, chosen: npt.NDArray[np.bool_] | None) -> Batch:
+    config, columns, exact = plan
     if chosen is None:
-        return batch_of(config, columns, rows.frames, rows.values)
+        return batch_of(config, columns, rows.frames, rows.values, exact=exact)
     time_ns, arrival_ns, stamp_source, time_quality = rows.frames
     frames = FrameValues(time_ns[chosen], arrival_ns[chosen], stamp_source[chosen], time_quality[chosen])
 
@@ -110,7 +113,7 @@ def _batch(config: StreamConfig, columns: Sequence[Column], rows: Rows, chosen: 
         found = rows.values(name)
         return None if found is None else found[chosen]
 
-    return batch_of(config, columns, frames, values)
+    return batch_of(config, columns, frames, values, exact=exact)
 
 
 def idcodes_of(numbers: npt.NDArray[np.float64] | None, count: int) -> npt.NDArray[np.int64]:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -73,8 +74,7 @@ def long_schema() -> Any:
     """Arrow schema of a table in long form: ``quantity`` is stat, freq_hz, mag and so on."""
     import pyarrow as pa
 
-    text = pa.dictionary(pa.int32(), pa.string())
-    return pa.schema([*_frame_fields(), *((name, text) for name in LONG_COLUMNS[:-1]), ("value", pa.float64())])
+    return pa.schema([*_frame_fields(), *((name, pa.string()) for name in LONG_COLUMNS[:-1]), ("value", pa.float64())])
 
 
 def wide_rows(batch: Batch, phasors: Phasors) -> Any:
@@ -97,7 +97,7 @@ def long_rows(batch: Batch, phasors: Phasors) -> Any:
     flat = np.stack([values[column.quantity][:, column.at].astype(np.float64) for column in columns], axis=1)
     codes = np.tile(np.arange(len(columns), dtype=np.int32), len(batch))
     names = [
-        pa.DictionaryArray.from_arrays(codes, [value or None for value in named])
+        pa.DictionaryArray.from_arrays(codes, [value or None for value in named]).dictionary_decode()
         for named in zip(*((column.station, column.channel, column.quantity) for column in columns), strict=True)
     ]
     arrays = [*_frame_arrays(batch, len(columns)), *names, pa.array(flat.reshape(-1))]
@@ -122,6 +122,20 @@ def _frame_arrays(batch: Batch, times: int) -> list[Any]:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Turn what Arrow raises on a damaged file into a SourceError."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except SourceError:
+        raise
+    except (OSError, ValueError, pa.ArrowException) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise SourceError(f"{path} is no readable {kind} file ({reason}); was its writer killed?") from None
 
 
 def arrow_source(
@@ -157,7 +171,14 @@ def _config_in(metadata: dict[bytes, bytes], path: Path) -> StreamConfig | None:
 
 
 def _rows(parts: Iterable[Any], defects: Counter[str]) -> Iterator[Rows]:
+    import pyarrow as pa
+
     for part in parts:
+        try:
+            part.validate(full=True)  # what was bent on the way may point anywhere
+        except (ValueError, pa.ArrowException):
+            defects["damaged rows"] += part.num_rows
+            continue
         for first in range(0, part.num_rows, BLOCK_FRAMES):
             rows = _Part(part.slice(first, BLOCK_FRAMES)).rows(defects)
             if len(rows.idcode):

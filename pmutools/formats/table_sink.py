@@ -51,7 +51,7 @@ class TableSink:
 
     @property
     def paths(self) -> list[Path]:
-        return [file.path for file in self._files] if self._writers else []
+        return [file.final_path for file in self._files] if self._writers else []
 
     def write(self, item: Message | Block) -> None:
         if isinstance(item, Message) or not len(item.batch):
@@ -115,7 +115,7 @@ class TableSink:
         station = config.stations[0].name if config.stations else ""
         safe = re.sub(r"[^\w.+-]+", "_", station).strip("._") or "stream"
         stem = f"{safe}-{config.idcode}"
-        taken = {file.path.name.casefold() for file in self._files}
+        taken = {file.final_path.name.casefold() for file in self._files}
         name, count = stem + self._suffix, 1
         while name.casefold() in taken:
             count += 1
