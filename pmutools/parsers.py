@@ -211,10 +211,10 @@ class Call(NamedTuple):
 def bind(cls: type[T], call: Call) -> T:
     """An instance of the dataclass ``cls`` from a call's arguments, positional in the order of its fields.
 
-    Raises ValueError naming the call and the parameter.
+    A call without a name stands for ``VALUE key=... key=...``. Raises ValueError naming the call and the parameter.
     """
     known = settable(cls)
-    usage = f"{call.name}({', '.join(known)})" if call.name else ", ".join(known)
+    usage = f"{call.name}({', '.join(known)})" if call.name else _phrase_usage(known)
     texts: dict[str, Any] = {}
     for position, text in enumerate(call.args):
         slots = list(known.values())
@@ -226,7 +226,9 @@ def bind(cls: type[T], call: Call) -> T:
             raise ValueError(f"{len(call.args)} arguments are too many; write {usage}")
     for key, text in call.named.items():
         if key not in known:
-            raise ValueError(f"{call.name or 'this'} has no {key!r}; {suggestion(key, known)}")
+            raise ValueError(
+                f"{call.name or 'there'} {'has' if call.name else 'is'} no {key!r}; {suggestion(key, known)}"
+            )
         if known[key].name in texts:
             raise ValueError(f"{key} is given twice; write {usage}")
         texts[known[key].name] = text
@@ -235,8 +237,12 @@ def bind(cls: type[T], call: Call) -> T:
         if item.name in texts:
             values[item.name] = _argument(call, key, item, texts[item.name])
         elif not is_optional(item):
-            raise ValueError(f"{key} is missing; write {usage}")
+            raise ValueError(f"{key if call.name else 'the value'} is missing; write {usage}")
     return cls(**values)
+
+
+def _phrase_usage(known: Collection[str]) -> str:
+    return " ".join(["VALUE", *(f"[{key}=...]" for key in list(known)[1:])])
 
 
 def _argument(call: Call, key: str, item: Field[Any], text: str | list[str]) -> Any:
@@ -246,7 +252,8 @@ def _argument(call: Call, key: str, item: Field[Any], text: str | list[str]) -> 
             return tuple(parse(one) for one in ([text] if isinstance(text, str) else text))
         return parse(text)
     except ValueError as error:
-        raise ValueError(f"{call.name} {key}: {error}" if call.name else f"{key}: {error}") from None
+        place = f"{call.name} {key}: " if call.name else f"{key}: " if key in call.named else ""
+        raise ValueError(f"{place}{error}") from None
 
 
 _CALL = re.compile(r"([A-Za-z][\w-]*)\s*(?:\((.*)\))?", re.DOTALL)

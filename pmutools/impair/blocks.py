@@ -41,7 +41,7 @@ class Blocks(Generic[T_co]):
 
     def __init__(self, chain: Chain[T_co], phase: int = 0) -> None:
         self._chain = chain
-        self._phase = phase % ANCHOR
+        self._phase = phase % BLOCK
         self._first = 0
         self._values: Sequence[T_co] = ()
 

@@ -19,7 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools.impair.blocks import Lanes
-from pmutools.impair.distributions import DISTRIBUTIONS, Constant, Distribution, Quantile, distribution_of
+from pmutools.impair.distributions import (
+    DISTRIBUTIONS,
+    Constant,
+    Distribution,
+    Quantile,
+    distribution,
+    distribution_of,
+    is_bare,
+)
 from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.quantiles import LEAST, MOST, Array, normal_cdf, normal_quantile
@@ -91,11 +99,13 @@ COURSES: Mapping[str, type[Course]] = {"step": Step, "ramp": Ramp, "sinusoid": S
 
 
 def delay_terms(text: str) -> tuple[Term, ...]:
-    """``DIST + DIST ...``; raises ValueError."""
+    """``DIST + DIST ...``, where a bare number is a constant; raises ValueError."""
     return tuple(_term(part) for part in split_top(text, "+"))
 
 
 def _term(text: str) -> Term:
+    if is_bare(text):
+        return distribution(text)
     parts = call(text)
     if parts.name == "trace":
         return bind(Trace, parts)

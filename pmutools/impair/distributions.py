@@ -300,8 +300,13 @@ LIMITS = ("shift", "min", "max")
 
 
 def distribution(text: str) -> Distribution:
-    """Parse one DIST; raises ValueError."""
-    return distribution_of(call(text))
+    """Parse one DIST; a bare number is a constant. Raises ValueError."""
+    return Constant(number()(text)) if is_bare(text) else distribution_of(call(text))
+
+
+def is_bare(text: str) -> bool:
+    """Whether a DIST is written as a number alone."""
+    return text[:1] in "0123456789.-"
 
 
 def distribution_of(parts: Call) -> Distribution:
