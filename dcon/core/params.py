@@ -82,11 +82,11 @@ class PmuParams:
     name: str
     nominal_kv: float | None = None
     """Line-to-line; None leaves its voltage unjudged."""
+    base_v: float = field(init=False)
+    """Nominal phase voltage, V; 0 where unknown."""
 
-    @property
-    def base_v(self) -> float:
-        """Nominal phase voltage, V; 0 where unknown."""
-        return self.nominal_kv * 1e3 / math.sqrt(3) if self.nominal_kv else 0.0
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "base_v", (self.nominal_kv or 0.0) * 1e3 / math.sqrt(3))
 
 
 class Pair(NamedTuple):

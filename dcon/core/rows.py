@@ -39,6 +39,8 @@ def config_change(_params: Params, _pmu: PmuParams, _last: Pmu, _new: Pmu, sampl
 
 
 def time_quality(params: Params, _pmu: PmuParams, _last: Pmu, _new: Pmu, sample: Sample) -> bool:
+    if sample.stat == 0 and sample.time_quality & 0xF == 0:
+        return False
     limit_ns = params.thresholds.max_clock_error_us * 1e3
     return (
         _MSG_TQ_ERROR_NS[sample.time_quality & 0xF] > limit_ns

@@ -35,6 +35,9 @@ class Pmu(NamedTuple):
     """Checks that are up, as bits."""
 
 
+_READY, _HELD = InstanceState.READY, InstanceState.HELD  # looking a member up costs as much as comparing it
+
+
 class Instance(NamedTuple):
     """One control instance."""
 
@@ -49,7 +52,7 @@ class Instance(NamedTuple):
 
     @property
     def is_ready(self) -> bool:
-        return self.state is InstanceState.READY or self.state is InstanceState.HELD
+        return self.state is _READY or self.state is _HELD
 
 
 class State(NamedTuple):

@@ -143,7 +143,7 @@ def _obey(params: Params, now: _Orders, order: Order, view: ArmView, events: lis
     elif (mode := mode_of(name)) is not None:
         why = "" if now.system in MODE_IS_FREE or mode is now.mode else f"not in {now.system}: disarm first"
         if not why:
-            events.append(Event(mode, _SYSTEM, "order"))
+            events.append(Event(str(mode), _SYSTEM, "order"))
             return now._replace(mode=mode)
     elif name == "gain":
         why = "" if 0 <= value <= params.gain_max_mw_per_mhz else f"must be 0 to {params.gain_max_mw_per_mhz:g} MW/mHz"
