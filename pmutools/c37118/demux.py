@@ -90,6 +90,8 @@ class _FlowState:
         self.host = _host(flow.source)
         self.framer = Framer(streaming=flow.is_stream)
         self.configs: dict[int, StreamConfig] = {}
+        self.borrowed: set[int] = set()
+        """IDCODEs whose configuration another flow has shown."""
         self.held: dict[int, _Held] = {}
         self.fragments: dict[int, tuple[int, bytearray]] = {}
         self.proven = False
@@ -107,6 +109,7 @@ class Demux:
         self._flows: dict[Flow, _FlowState] = {}
         self._configs: dict[_Place, dict[Flow, StreamConfig]] = {}
         self._waiting: dict[_Place, dict[Flow, _FlowState]] = {}
+        self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
 
     def feed(self, chunk: Chunk) -> list[Message | Loss]:
         """Messages and losses that this chunk completes."""
@@ -157,6 +160,7 @@ class Demux:
             self._waiting.get((state.host, idcode), {}).pop(state.flow, None)
         for idcode in state.configs:
             self._configs.get((state.host, idcode), {}).pop(state.flow, None)
+            self._borrowers.get((state.host, idcode), {}).pop(state.flow, None)
         if not state.proven and state.early_bytes:
             self.tally.ignored += state.early_bytes
             self.tally.ignored_flows += 1
@@ -221,9 +225,14 @@ class Demux:
         if config is None or kind is FrameType.CFG1:  # CFG-1 says what a device could send, not what it sends
             return
         current = state.configs.get(config.idcode)
+        place = (state.host, config.idcode)
         if current is None or current != config:
             state.configs[config.idcode] = config
-        place = (state.host, config.idcode)
+            state.borrowed.discard(config.idcode)
+            for other in self._borrowers.pop(place, {}).values():  # they look again
+                if config.idcode in other.borrowed:
+                    del other.configs[config.idcode]
+                    other.borrowed.discard(config.idcode)
         self._configs.setdefault(place, {})[state.flow] = state.configs[config.idcode]
         for other in list(self._waiting.get(place, {}).values()):
             self._release(other, state.configs[config.idcode], out)
@@ -249,6 +258,8 @@ class Demux:
         config = fitting.pop()
         if idcode not in state.configs:
             state.configs[idcode] = config
+            state.borrowed.add(idcode)
+            self._borrowers.setdefault((state.host, idcode), {})[state.flow] = state
         return config
 
     def _hold(self, state: _FlowState, frame: Frame, out: list[Message | Loss]) -> None:
