@@ -66,11 +66,16 @@ class Step(NamedTuple):
 ClientTable = Mapping[tuple[ClientState, ClientEvent], Step]
 _S, _E, _A = ClientState, ClientEvent, ClientAction
 
-_ENDS = {(state, _E.CLOSED): Step(_S.IDLE) for state in ClientState if state is not _S.IDLE} | {
-    (state, _E.STOP): Step(_S.IDLE, (_A.SEND_STOP,)) for state in ClientState if state is not _S.IDLE
-}
 
-CFG2_FIRST: ClientTable = _ENDS | {
+def _ends(*states: ClientState, goodbye: tuple[ClientAction, ...] = ()) -> dict[tuple[ClientState, ClientEvent], Step]:
+    """How each of ``states`` ends: the transport is gone, or the user stops."""
+    return {(state, _E.CLOSED): Step(_S.IDLE) for state in states} | {
+        (state, _E.STOP): Step(_S.IDLE, goodbye) for state in states
+    }
+
+
+CFG2_FIRST: ClientTable = {
+    **_ends(_S.WAIT_CFG2, _S.WAIT_DATA, _S.STREAMING, goodbye=(_A.SEND_STOP,)),
     (_S.IDLE, _E.OPENED): Step(_S.WAIT_CFG2, (_A.REQUEST_CFG2,)),
     (_S.WAIT_CFG2, _E.CONFIG): Step(_S.WAIT_DATA, (_A.SEND_START,)),
     (_S.WAIT_CFG2, _E.TIMEOUT): Step(_S.WAIT_CFG2, (_A.REQUEST_CFG2,)),
@@ -86,6 +91,7 @@ CFG2_FIRST: ClientTable = _ENDS | {
 
 CFG3_FIRST: ClientTable = {
     **CFG2_FIRST,
+    **_ends(_S.WAIT_CFG3, goodbye=(_A.SEND_STOP,)),
     (_S.IDLE, _E.OPENED): Step(_S.WAIT_CFG3, (_A.REQUEST_CFG3,)),
     (_S.WAIT_CFG3, _E.CONFIG): Step(_S.WAIT_DATA, (_A.SEND_START,)),
     (_S.WAIT_CFG3, _E.TIMEOUT): Step(_S.WAIT_CFG2, (_A.FALL_BACK, _A.REQUEST_CFG2)),
@@ -101,7 +107,7 @@ SAVED_CONFIG: ClientTable = {
 """Commanded, with a configuration known beforehand: start without waiting for the server's."""
 
 SPONTANEOUS: ClientTable = {
-    **{pair: Step(_S.IDLE) for pair in _ENDS},
+    **_ends(_S.WAIT_CFG2, _S.WAIT_DATA, _S.STREAMING),
     (_S.IDLE, _E.OPENED): Step(_S.WAIT_CFG2),
     (_S.WAIT_CFG2, _E.CONFIG): Step(_S.WAIT_DATA),
     (_S.WAIT_CFG2, _E.DATA): Step(_S.STREAMING),

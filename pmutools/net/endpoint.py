@@ -72,6 +72,11 @@ def is_multicast(host: str) -> bool:
         return False
 
 
+def scoped(host: str, iface: str | None) -> str:
+    """An IPv6 group with its interface: those of link scope exist once on each."""
+    return f"{host}%{iface}" if iface and ":" in host and "%" not in host and is_multicast(host) else host
+
+
 def join_host(host: str, port: int) -> str:
     """``host:port``, or ``[host]:port`` for IPv6."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -35,7 +35,7 @@ from pmutools.c37118.session import (
 from pmutools.clock import Clock
 from pmutools.flow import Chunk, Flow
 from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind
-from pmutools.net.endpoint import Endpoint, Scheme, is_multicast
+from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
 from pmutools.net.link import CommandLink, Plumbing
 from pmutools.net.reactor import READ, Reactor
 from pmutools.net.sockets import RCVBUF_BYTES, Address
@@ -148,7 +148,10 @@ class Receivers:
         return out
 
     def parse(self, item: Chunk | LinkEvent) -> list[Message | Loss]:
-        """The messages that a polled item completes, of wanted streams only; also moves the conversation on."""
+        """The messages that a polled item completes, of wanted streams only.
+
+        Also moves the conversation on; the news of that come with the next :meth:`poll`.
+        """
         if isinstance(item, LinkEvent):
             return self._end(item.flow) if item.kind in _ENDS and item.flow is not None else []
         out: list[Message | Loss] = []
@@ -210,6 +213,7 @@ class Receivers:
             self._out.append(LinkEvent(LinkKind.BOUND, f"udp://{listener.sock.address}", listener.owners, detail))
 
     def _listen(self, endpoint: Endpoint, host: str, port: int, source: str | None) -> _Listener:
+        host = scoped(host, endpoint.iface)
         key = (host, port)
         listener = self._listeners.get(key) if port else None
         if listener is None:

@@ -24,7 +24,7 @@ from pmutools.c37118.session import Served
 from pmutools.clock import Clock
 from pmutools.errors import SettingsError
 from pmutools.net.audience import Audience, Flushable, Outbox, UdpSink
-from pmutools.net.endpoint import Endpoint, Scheme, is_multicast
+from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
 from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
 from pmutools.net.reactor import Reactor
 from pmutools.net.sockets import Address, resolve
@@ -120,7 +120,7 @@ class Senders:
             raise SettingsError(f"{endpoint}: {endpoint.scheme}:// is served to those who connect; use --listen for it")
         if not endpoint.port:
             raise SettingsError(f"{endpoint}: port 0 is nowhere to send to")
-        where = target(resolve(endpoint.host, endpoint.port, datagram=True))
+        where = target(resolve(scoped(endpoint.host, endpoint.iface), endpoint.port, datagram=True))
         group = is_multicast(where.address.host)
         local = endpoint.source or ("::" if where.address.family == socket.AF_INET6 else "0.0.0.0")
         box = self._box(local, endpoint.iface if group else None, endpoint.ttl)

@@ -55,6 +55,7 @@ _REMEDIES = {
     errno.EADDRNOTAVAIL: "this machine does not have that address; use 0.0.0.0 for every local address",
     errno.EACCES: "not permitted; ports below 1024 need privilege, broadcast addresses a network that allows them",
     errno.EPERM: "not permitted; does a local firewall forbid it?",
+    errno.EINVAL: "not accepted; a link-local IPv6 address needs its interface (iface=NAME)",
     errno.ECONNREFUSED: "refused: nothing serves this port; is the device on, and the port right?",
     errno.ECONNRESET: "the other side reset the connection",
     errno.EPIPE: "the other side closed the connection",
