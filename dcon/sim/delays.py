@@ -29,8 +29,13 @@ class Delays(NamedTuple):
 
 
 def split(total_ms: float) -> Delays:
-    """Share ``total_ms`` out: the command takes up to 11 ms, the wait for the tick up to 11 ms, arrival the rest."""
+    """Share ``total_ms`` out as Table I does.
+
+    What is missing from 82 ms is taken from arrival first; what is more goes to the command, since frames that arrive
+    too late would disable the controller instead of delaying it.
+    """
     total_ns = round(total_ms * MS)
     command_ns = min(COMMAND_MS * MS, total_ns)
     control_ns = min(CONTROL_MS * MS, total_ns - command_ns)
-    return Delays(total_ns - command_ns - control_ns, control_ns, command_ns)
+    arrival_ns = min((PMU_MS + NETWORK_MS) * MS, total_ns - command_ns - control_ns)
+    return Delays(arrival_ns, control_ns, total_ns - arrival_ns - control_ns)
