@@ -178,8 +178,8 @@ def data_rate_of(time_ns: npt.NDArray[np.int64]) -> int | None:
 
 
 def nominal_hz_of(frequencies: npt.NDArray[np.float64], data_rate: int | None) -> float:
-    """50 or 60 Hz, whichever is nearer to the median frequency, or else goes with the rate."""
-    known = frequencies[np.isfinite(frequencies)]
+    """50 or 60 Hz, whichever is nearer to the median of plausible frequencies, or else goes with the rate."""
+    known = frequencies[(frequencies > 40) & (frequencies < 65)]
     if len(known):
-        return 50.0 if abs(float(np.median(known)) - 50) < abs(float(np.median(known)) - 60) else 60.0
+        return 50.0 if float(np.median(known)) < 55 else 60.0
     return 50.0 if data_rate in (25, 50, 100, 200) else 60.0

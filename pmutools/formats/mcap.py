@@ -47,7 +47,10 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> ByteSource:
 
 
 class LogSink(FrameSink):
-    """Logs data frames by the name of their station (of a concentrator's stream: its IDCODE)."""
+    """Logs data frames by the name of their station (of a concentrator's stream: its IDCODE).
+
+    Connections between the same two endpoints are one PMU.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -60,7 +63,7 @@ class LogSink(FrameSink):
         frame, flow, config = message
         if config is None or not (frame.type is FrameType.DATA or frame.type.is_config):
             return
-        key = (flow, config.idcode)
+        key = (flow._replace(connection=0), config.idcode)
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = unique([_name(config)], self._names.values())[0]

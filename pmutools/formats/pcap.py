@@ -17,6 +17,7 @@ from pmutools.formats.sink import FrameSink, SinkOptions
 from pmutools.formats.source import ByteSource
 
 LOSSES = (Fate.TRUNCATED, Fate.FRAGMENT_LOST, Fate.DAMAGED, Fate.TCP_STRAY, Fate.UNSUPPORTED_LINK)
+DYNAMIC_PORT = 49152
 
 
 def read(path: Path, configs: Iterable[StreamConfig] = ()) -> ByteSource:
@@ -41,7 +42,10 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> ByteSource:
 
 
 class CaptureSink(FrameSink):
-    """One packet a frame. In a .pcap, which needs a time, a frame without an arrival has that of its stamp."""
+    """One packet a frame. In a .pcap, which needs a time, a frame without an arrival has that of its stamp.
+
+    The unknown end of a TCP flow becomes the unspecified address, at the first dynamic port.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -57,6 +61,9 @@ class CaptureSink(FrameSink):
                 prefix = decode_prefix(frame.data)
                 self._last_ns = timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base)
             arrival_ns = self._last_ns
+        if flow.transport == "tcp" and not flow.destination:
+            host = "[::]" if flow.source.startswith("[") else "0.0.0.0"
+            flow = flow._replace(destination=f"{host}:{DYNAMIC_PORT}")
         self._writer.write(Chunk(frame.data, arrival_ns, flow, frame.stamp_source))
 
     def flush(self) -> None:

@@ -6,6 +6,7 @@ import gzip
 import random
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from support.recordings import blocks_of, data_of, messages_of, read, write
 
 from pmutools.c37118 import decode_config
 from pmutools.errors import SettingsError, SourceError
+from pmutools.flow import Flow
 from pmutools.formats import FORMATS, open_sink, open_source
 from pmutools.formats.parquet import ROW_GROUP_ROWS, ParquetRows
 from pmutools.formats.table import wide_schema
@@ -127,6 +129,31 @@ def test_csv_goes_to_standard_output() -> None:
     assert lines[0].startswith("time,arrival_ns")
     assert len(lines) == 5
     assert lines[-1] == "after"
+
+
+@pytest.mark.parametrize("host", ["192.0.2.9", "[2001:db8::9]"])
+def test_a_capture_of_connections_whose_other_end_is_unknown(host: str, tmp_path: Path) -> None:
+    """As a reader sees them: one after the other, from the same PMU."""
+    flows = [Flow("tcp", f"{host}:4712", "", connection) for connection in (0, 1)]
+    before = [message for flow in flows for message in messages_of(STREAM, flow=flow)]
+    after = read(write(tmp_path / "a.pcapng", before)[0])
+    assert [m.frame.data for m in after] == [m.frame.data for m in before]
+    assert [(m.flow.source, m.flow.connection) for m in after] == [(m.flow.source, m.flow.connection) for m in before]
+
+
+def test_a_log_names_each_pmu_once(tmp_path: Path) -> None:
+    """Also one that connects again; another of the same name is told apart; a concentrator goes by its IDCODE."""
+    pdc = random_stream(random.Random(1), stations=3, frames=2, idcode=60)
+    flows = [
+        Flow("tcp", "192.0.2.9:4712", ""),
+        Flow("tcp", "192.0.2.9:4712", "", 1),
+        Flow("tcp", "192.0.2.10:4712", ""),
+    ]
+    before = [message for flow in flows for message in messages_of(STREAM, flow=flow)]
+    (path,) = write(tmp_path / "a.mcap", [*before, *messages_of(pdc)])
+    station = STREAM.spec.stations[0].name.under("cfg2")
+    counts = Counter(message.flow.source.removeprefix("a.mcap/") for message in read(path))
+    assert counts == {station: 22, f"{station}#2": 11, "PDC60": 3}
 
 
 # --- what other programs see ------------------------------------------------------------------------------------

@@ -187,5 +187,6 @@ def test_gaps_repeats_and_slow_streams_do_not_mislead(period_s: int, count: int)
 def test_nominal_frequency() -> None:
     assert nominal_hz_of(np.array([np.nan, 49.2]), 60) == 50
     assert nominal_hz_of(np.array([59.0, 61.0]), 50) == 60
+    assert nominal_hz_of(np.array([49.9, 65.536, 65.536]), 50) == 50
     assert nominal_hz_of(np.array([np.nan]), 25) == 50
     assert nominal_hz_of(np.empty(0), None) == 60
