@@ -9,9 +9,11 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
+if TYPE_CHECKING:  # columns bring their own operations: nothing here needs numpy to be imported
+    import numpy as np
+    import numpy.typing as npt
 
 NS = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -34,18 +36,19 @@ def to_ns_array(
     soc: npt.NDArray[np.unsignedinteger], fracsec: npt.NDArray[np.unsignedinteger], time_base: int
 ) -> npt.NDArray[np.int64]:
     """:func:`to_ns` over columns of shape (N,)."""
-    fraction_ns = (fracsec.astype(np.int64) * NS + time_base // 2) // time_base
-    return soc.astype(np.int64) * NS + fraction_ns
+    fraction_ns = (fracsec.astype("i8") * NS + time_base // 2) // time_base
+    time_ns: npt.NDArray[np.int64] = soc.astype("i8") * NS + fraction_ns
+    return time_ns
 
 
 def from_ns_array(
     time_ns: npt.NDArray[np.int64], time_base: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """:func:`from_ns` over a column of shape (N,)."""
-    soc, frac_ns = np.divmod(time_ns, NS)
+    soc, frac_ns = divmod(time_ns, NS)
     fracsec = (frac_ns * time_base + NS // 2) // NS
     carry = fracsec >= time_base
-    return soc + carry, np.where(carry, 0, fracsec)
+    return soc + carry, fracsec * ~carry
 
 
 def slot(time_ns: int, rate: Fraction) -> int:
@@ -81,7 +84,7 @@ def parse_utc(text: str) -> int:
 
 def slots_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
     """:func:`slot` over a column of shape (N,), for a whole number of frames per second or of seconds per frame."""
-    soc, frac_ns = np.divmod(time_ns, NS)
+    soc, frac_ns = divmod(time_ns, NS)
     slots: npt.NDArray[np.int64]
     if rate.denominator == 1:
         slots = soc * rate.numerator + (frac_ns * rate.numerator + NS // 2) // NS
@@ -92,7 +95,7 @@ def slots_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[n
 
 def grid_offset_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
     """Signed distance in ns of each stamp (N,) from its nearest reporting instant, at a rate as in slots_array."""
-    frac_ns = np.mod(time_ns, NS)
+    frac_ns = time_ns % NS
     offset: npt.NDArray[np.int64]
     if rate.denominator == 1:
         nearest = (frac_ns * rate.numerator + NS // 2) // NS
