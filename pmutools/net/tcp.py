@@ -23,7 +23,7 @@ QUEUE_BYTES = 256 << 10
 """Bytes that may wait for one slow client, beside the kernel's send buffer of the same size."""
 STALL_NS = 10_000_000_000
 """A client that takes nothing for so long while bytes wait for it is disconnected."""
-_BACKLOG = 128
+_BACKLOG = 1024
 _VANISHED_MS = 30_000
 
 

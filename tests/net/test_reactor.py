@@ -1,0 +1,81 @@
+"""The loop: timers in order and cancellable, virtual time that jumps, sockets forgotten while others are handled."""
+
+from __future__ import annotations
+
+import socket
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pmutools.clock import VirtualClock
+from pmutools.net.reactor import READ, WRITE, Reactor
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.booleans()), max_size=30))
+def test_timers_ring_in_order_unless_cancelled(timers: list[tuple[int, bool]]) -> None:
+    clock = VirtualClock()
+    reactor = Reactor(clock)
+    rung: list[tuple[int, int]] = []
+    for number, (at_ns, cancelled) in enumerate(timers):
+        timer = reactor.call_at(at_ns, lambda number=number, at_ns=at_ns: rung.append((at_ns, number)))  # type: ignore[misc]
+        timer.cancelled = cancelled
+    while clock.monotonic_ns() < 1000:
+        reactor.run(1000 - clock.monotonic_ns())
+    assert rung == sorted((at_ns, number) for number, (at_ns, cancelled) in enumerate(timers) if not cancelled)
+    reactor.close()
+
+
+def test_virtual_time_waits_for_no_socket() -> None:
+    clock = VirtualClock()
+    reactor = Reactor(clock)
+    left, right = socket.socketpair()
+    heard: list[int] = []
+    reactor.watch(left, READ, lambda _: heard.append(clock.monotonic_ns()))
+    reactor.run(5_000_000_000_000)
+    assert (clock.monotonic_ns(), heard) == (5_000_000_000_000, [])
+    right.send(b"x")
+    reactor.run(1)
+    assert heard == [5_000_000_000_000]
+    assert clock.monotonic_ns() == 5_000_000_000_000
+    reactor.close()
+    left.close()
+    right.close()
+
+
+def test_a_socket_closed_by_another_handler_is_not_handled() -> None:
+    reactor = Reactor(VirtualClock())
+    pairs = [socket.socketpair() for _ in range(2)]
+    called: list[int] = []
+
+    def handle(number: int) -> None:
+        called.append(number)
+        for ours, _ in pairs:
+            reactor.forget(ours)
+            ours.close()
+
+    for number, (ours, theirs) in enumerate(pairs):
+        theirs.send(b"x")
+        reactor.watch(ours, READ, lambda _, number=number: handle(number))  # type: ignore[misc]
+    reactor.run(0)
+    assert len(called) == 1
+    reactor.forget(pairs[0][0])  # once more does no harm
+    reactor.run(0)
+    assert len(called) == 1
+    reactor.close()
+    for _, theirs in pairs:
+        theirs.close()
+
+
+def test_watching_again_replaces() -> None:
+    reactor = Reactor(VirtualClock())
+    left, right = socket.socketpair()
+    heard: list[str] = []
+    reactor.watch(left, READ | WRITE, lambda events: heard.append(f"first {events}"))
+    reactor.run(0)
+    reactor.watch(left, READ, lambda events: heard.append(f"second {events}"))
+    right.send(b"x")
+    reactor.run(0)
+    assert heard == [f"first {WRITE}", f"second {READ}"]
+    reactor.close()
+    left.close()
+    right.close()

@@ -1,0 +1,471 @@
+"""The sending front end: what clients ask for they get, and no client harms another."""
+
+from __future__ import annotations
+
+import random
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from support.live import CLOCK, PATIENCE_NS, Ear, data_frame, free_udp_port, stream, values
+
+from pmutools import linux
+from pmutools.c37118 import Command, Frame, Framer, FrameType, StreamConfig, decode_prefix, encode_command
+from pmutools.c37118.session import Outcome, served
+from pmutools.clock import VirtualClock
+from pmutools.errors import SettingsError, SourceError
+from pmutools.net import outlet as outlet_module
+from pmutools.net import tcp
+from pmutools.net.dialogue import LinkKind
+from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
+from pmutools.net.outlet import ServerEvent, ServerKind
+from pmutools.net.receiver import Receivers
+from pmutools.net.server import Senders
+
+pytestmark = pytest.mark.realtime
+MS = 1_000_000
+CONFIG = stream(7)
+START = encode_command(7, Command.START_DATA)
+paths = pytest.mark.parametrize("native", [linux.NATIVE, False], ids=["native", "portable"])
+
+
+class Server:
+    """Senders with one listening outlet, and the events they have given."""
+
+    def __init__(self, url: str, *configs: StreamConfig, **options: object) -> None:
+        self.senders = Senders(CLOCK, **options)  # type: ignore[arg-type]
+        self.handles = [self.senders.add(served(config)) for config in configs or (CONFIG,)]
+        self.outlet = self.senders.listen(parse_endpoint(url), self.handles)
+        self.events: list[ServerEvent] = []
+
+    @property
+    def address(self) -> tuple[str, int]:
+        address = self.senders.local(self.outlet)
+        assert address is not None
+        return address.host, address.port
+
+    def until(self, condition: Callable[[], object]) -> None:
+        end_ns = CLOCK.monotonic_ns() + PATIENCE_NS
+        while not condition():
+            assert CLOCK.monotonic_ns() < end_ns, f"never came true; {self.events[-20:]}"
+            self.events += self.senders.poll(MS)
+
+    def kinds(self) -> list[ServerKind | Outcome]:
+        return [event.kind for event in self.events]
+
+    def publish(self, count: int, first: int = 0, stream: int = 0) -> None:
+        for k in range(first, first + count):
+            self.senders.publish([(self.handles[stream], data_frame(CONFIG, k * 10**9, value=k))])
+
+
+@contextmanager
+def serving(url: str, *configs: StreamConfig, **options: object) -> Iterator[Server]:
+    server = Server(url, *configs, **options)
+    with server.senders:
+        yield server
+
+
+class Client:
+    """A plain TCP client."""
+
+    def __init__(self, server: Server) -> None:
+        self.sock = socket.create_connection(server.address)
+        self.sock.setblocking(False)
+        self.framer = Framer(streaming=True)
+        self.frames: list[Frame] = []
+        self.ended = False
+
+    def say(self, data: bytes) -> None:
+        self.sock.setblocking(True)
+        self.sock.sendall(data)
+        self.sock.setblocking(False)
+
+    def hear(self) -> list[Frame]:
+        try:
+            while data := self.sock.recv(65536):
+                for item in self.framer.feed(data):
+                    assert isinstance(item, Frame)
+                    self.frames.append(item)
+            self.ended = True
+        except BlockingIOError:
+            pass
+        except ConnectionResetError:
+            self.ended = True
+        return self.frames
+
+
+@contextmanager
+def clients(server: Server, count: int) -> Iterator[list[Client]]:
+    joined = [Client(server) for _ in range(count)]
+    yield joined
+    for client in joined:
+        client.sock.close()
+
+
+@contextmanager
+def hearing(*urls: str) -> Iterator[Ear]:
+    with Receivers([parse_endpoint(url) for url in urls], CLOCK) as receivers:
+        yield Ear(receivers)
+
+
+# --- commands
+
+
+@paths
+@pytest.mark.parametrize("scheme", ["tcp", "udp+cmd", "tcp+udp"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_our_client_and_our_server_understand_each_other(scheme: str, host: str, native: bool) -> None:
+    data = f"data={free_udp_port(host.strip('[]'))}&" if scheme == "tcp+udp" else ""
+    with serving(f"{scheme}://{host}:0?{data}".rstrip("?&"), native=native) as server:
+        with hearing(f"{scheme}://{host}:{server.address[1]}?{data}idcode=7") as ear:
+            events = ear.until(lambda: server.senders.audience(server.handles[0]) == 1, server.senders)
+            server.publish(20)
+            events += ear.until(lambda: values(ear.messages) == list(range(20)), server.senders)
+            assert ear.kinds[-2:] == [LinkKind.CONFIGURED, LinkKind.STREAMING]
+        server.events += events
+        server.until(lambda: Outcome.STOPPED in server.kinds())
+        assert server.senders.audience(server.handles[0]) == 0
+        server.publish(1)
+
+
+def test_every_command_over_tcp() -> None:
+    with serving("tcp://127.0.0.1:0", CONFIG, stream(9)) as server, clients(server, 1) as (client,):
+        for code in (Command.SEND_CFG1, Command.SEND_CFG2, Command.SEND_CFG3):
+            client.say(encode_command(9, code))
+        client.say(encode_command(9, Command.SEND_HEADER) + encode_command(9, 0x0123) + encode_command(5, 2))
+        client.say(encode_command(7, Command.EXTENDED, extended=b"hi"))
+        server.until(lambda: Outcome.EXTENDED in server.kinds() and len(client.hear()) == 3)
+        assert [(frame.type, frame.idcode) for frame in client.frames] == [
+            (FrameType.CFG1, 9),
+            (FrameType.CFG2, 9),
+            (FrameType.CFG3, 9),
+        ]
+        assert server.kinds() == [
+            ServerKind.CONNECTED,
+            *[Outcome.ANSWERED] * 3,
+            Outcome.UNAVAILABLE,
+            Outcome.UNKNOWN,
+            Outcome.FOREIGN,
+            Outcome.EXTENDED,
+        ]
+        assert server.events[-1].extended == b"hi"
+        assert abs(decode_prefix(client.frames[1].data).soc - time.time()) < 5
+
+
+def test_commands_split_and_merged_at_random() -> None:
+    rng = random.Random(5)
+    wire = encode_command(7, Command.SEND_CFG2) * 40
+    cuts = sorted(rng.sample(range(1, len(wire)), 60))
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        for start, end in zip([0, *cuts], [*cuts, len(wire)], strict=True):
+            client.say(wire[start:end])
+            server.senders.poll(0)
+        server.until(lambda: len(client.hear()) == 40)
+
+
+def test_each_client_has_its_own_start_and_stop() -> None:
+    with serving("tcp://127.0.0.1:0", CONFIG, stream(9)) as server, clients(server, 3) as (one, both, none):
+        one.say(START)
+        both.say(START + encode_command(9, Command.START_DATA))
+        server.until(
+            lambda: server.kinds().count(Outcome.STARTED) == 3 and server.kinds().count(ServerKind.CONNECTED) == 3
+        )
+        server.publish(2)
+        server.senders.publish([(server.handles[1], data_frame(stream(9), 10**9))])
+        server.until(lambda: len(one.hear()) == 2 and len(both.hear()) == 3)
+        one.say(encode_command(7, Command.STOP_DATA))
+        server.until(lambda: Outcome.STOPPED in server.kinds())
+        server.publish(1, first=2)
+        server.until(lambda: len(both.hear()) == 4)
+        assert (len(one.hear()), len(none.hear())) == (2, 0)
+
+
+def test_many_clients() -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 150) as joined:
+        for client in joined:
+            client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 150)
+        server.publish(30)
+        server.until(lambda: all(len(client.hear()) == 30 for client in joined))
+
+
+def test_udp_clients_by_address() -> None:
+    with (
+        serving("udp+cmd://127.0.0.1:0") as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        for sock in (one, other):
+            sock.settimeout(2)
+            sock.sendto(START, server.address)
+        other.sendto(b"\xaa\x41garbage", server.address)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 2)
+        one.sendto(encode_command(7, Command.STOP_DATA), server.address)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+        server.publish(1)
+        assert other.recv(100) == data_frame(CONFIG, 0)
+        one.settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            one.recv(100)
+
+
+def test_clients_that_share_a_data_port_get_each_frame_once() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as data:
+        data.bind(("127.0.0.1", 0))
+        data.settimeout(0.05)
+        with serving(f"tcp+udp://127.0.0.1:0?data={data.getsockname()[1]}") as server, clients(server, 2) as joined:
+            for client in joined:
+                client.say(START)
+            server.until(lambda: server.kinds().count(Outcome.STARTED) == 2)
+            joined[0].sock.close()
+            server.until(lambda: ServerKind.DISCONNECTED in server.kinds())
+            server.publish(1)
+            assert data.recv(100) == data_frame(CONFIG, 0)
+            with pytest.raises(TimeoutError):
+                data.recv(100)
+            assert joined[1].hear() == []
+
+
+# --- clients that misbehave
+
+
+def test_a_slow_client_neither_delays_others_nor_grows_memory() -> None:
+    big = stream(7, phasors=200)
+    with serving("tcp://127.0.0.1:0", big, queue_bytes=32_768) as server, clients(server, 2) as (slow, fast):
+        for client in (slow, fast):
+            client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 2)
+        spent_ns, failed = [], 0
+        for k in range(8000):
+            frame = data_frame(big, k * 10**9)
+            before_ns = CLOCK.monotonic_ns()
+            failed += len(server.senders.publish([(server.handles[0], frame)]))
+            spent_ns.append(CLOCK.monotonic_ns() - before_ns)
+            if k % 10 == 0:
+                fast.hear()
+                server.senders.poll(0)
+        server.until(lambda: len(fast.hear()) == 8000)
+        assert failed > 0  # the slow one's queue was full
+        assert sorted(spent_ns)[7920] < 5 * MS  # no send waited for it
+        got = len(slow.hear())
+        server.until(lambda: len(slow.hear()) == 8000 - failed)  # it gets the rest when it reads, frames whole
+        assert got < 8000
+
+
+def test_a_stalled_client_is_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "STALL_NS", 50 * MS)
+    monkeypatch.setattr("pmutools.net.server.HOUSEKEEPING_NS", 20 * MS)
+    big = stream(7, phasors=200)
+    with serving("tcp://127.0.0.1:0", big, queue_bytes=32_768) as server, clients(server, 1) as (client,):
+        client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+
+        def stalled() -> bool:
+            server.senders.publish([(server.handles[0], data_frame(big, 0))])
+            return ServerKind.STALLED in server.kinds()
+
+        server.until(stalled)
+        assert "frames were dropped" in server.events[-1].detail
+        assert server.senders.audience(server.handles[0]) == 0
+        server.until(lambda: client.hear() and client.ended)
+
+
+@pytest.mark.parametrize("reset", [False, True], ids=["fin", "rst"])
+def test_a_client_that_vanishes_is_forgotten(reset: bool) -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 2) as (gone, stays):
+        for client in (gone, stays):
+            client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 2)
+        if reset:
+            gone.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        gone.sock.close()
+        server.publish(5)  # before the server has looked
+        server.until(lambda: ServerKind.DISCONNECTED in server.kinds())
+        server.publish(5, first=5)
+        server.until(lambda: len(stays.hear()) == 10)
+        assert server.senders.audience(server.handles[0]) == 1
+
+
+def test_garbage_ends_the_connection_after_its_measure() -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        client.say(b"GET / HTTP/1.1\r\n\r\n" + START)
+        server.until(lambda: Outcome.STARTED in server.kinds())  # a little garbage is skipped
+        client.say(b"\x00" * (outlet_module.GARBAGE_BYTES + 20))
+        server.until(lambda: ServerKind.GARBAGE in server.kinds())
+        server.until(lambda: client.hear() is not None and client.ended)
+
+
+@pytest.mark.parametrize("code", [Command.SEND_CFG2, Command.START_DATA, 0x0007])
+def test_a_flood_of_commands_is_bounded(code: int) -> None:
+    """A client that asks without reading: its answers are dropped beyond its queue, others are served."""
+    with serving("tcp://127.0.0.1:0", queue_bytes=32_768) as server, clients(server, 2) as (flood, other):
+        other.say(START)
+        wire = encode_command(7, code) * 500
+        for _ in range(40):
+            try:
+                flood.sock.send(wire)
+            except BlockingIOError:
+                break
+            server.events += server.senders.poll(0)
+        server.until(lambda: server.senders.audience(server.handles[0]) >= 1)
+        server.publish(3)
+        server.until(lambda: len(other.hear()) == 3)
+
+
+def test_too_many_clients_are_turned_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet_module, "MAX_CLIENTS", 3)
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 4) as joined:
+        server.until(lambda: ServerKind.TURNED_AWAY in server.kinds())
+        server.until(lambda: [client.hear() is not None and client.ended for client in joined] == [False] * 3 + [True])
+    with serving("udp+cmd://127.0.0.1:0") as server:
+        for _ in range(4):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+                sock.sendto(START, server.address)
+                seen = len(server.events)
+                server.until(lambda seen=seen: len(server.events) > seen)  # type: ignore[misc]
+        assert server.kinds() == [Outcome.STARTED] * 3 + [ServerKind.TURNED_AWAY]
+
+
+def test_clients_can_be_sent_away_and_come_back() -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        server.until(lambda: ServerKind.CONNECTED in server.kinds())
+        server.senders.disconnect(server.outlet, reset=True)
+        server.until(lambda: client.hear() is not None and client.ended)
+        with clients(server, 1):
+            server.until(lambda: server.kinds().count(ServerKind.CONNECTED) == 2)
+
+
+# --- spontaneous
+
+
+@paths
+def test_spontaneous_streams_announce_themselves(native: bool) -> None:
+    port = free_udp_port()
+    with hearing(f"udp://127.0.0.1:{port}") as ear, Senders(CLOCK, cfg_period_ns=640 * MS, native=native) as senders:
+        handles = [senders.add(served(stream(idcode))) for idcode in range(1, 129)]
+        senders.send_to(parse_endpoint(f"udp://127.0.0.1:{port}"), handles)
+        senders.announce()
+        assert (
+            senders.publish([(handle, data_frame(stream(handle + 1), 10**9, value=handle)) for handle in handles]) == []
+        )
+        ear.until(lambda: values(ear.messages) == list(range(128)))
+        assert len(ear.messages) == 256
+        end_ns = CLOCK.monotonic_ns() + 700 * MS
+        ear.until(lambda: CLOCK.monotonic_ns() > end_ns, senders)
+        again = ear.messages[256:]
+        assert {message.frame.idcode for message in again} == set(range(1, 129))  # everyone within a period,
+        stamps = [message.frame.arrival_ns or 0 for message in again]
+        assert max(stamps) - min(stamps) > 400 * MS  # and not in one burst
+
+
+@pytest.mark.skipif(not linux.NATIVE, reason="Linux multicast")
+def test_one_stream_to_a_group_and_to_an_address() -> None:
+    group, single = free_udp_port(), free_udp_port()
+    urls = [f"udp://239.192.9.1:{group}?iface=127.0.0.1", f"udp://127.0.0.1:{single}?source=127.0.0.5"]
+    with Receivers([parse_endpoint(url) for url in urls], CLOCK) as receivers, Senders(CLOCK) as senders:
+        ear, stream_7 = Ear(receivers), senders.add(served(CONFIG))
+        for url in (f"udp://239.192.9.1:{group}?iface=127.0.0.1&ttl=0", urls[1]):
+            senders.send_to(parse_endpoint(url), [stream_7])
+        assert senders.audience(stream_7) == 2
+        senders.announce([stream_7])
+        senders.publish([(stream_7, data_frame(CONFIG, 0, value=1))])
+        ear.until(lambda: values(ear.messages) == [1, 1])
+        owners = {ear.receivers.owners(message.flow, 7) for message in ear.messages}
+        assert owners == {(0,), (1,)}
+
+
+def test_a_changed_configuration_is_what_is_answered_and_announced_from_then_on() -> None:
+    port = free_udp_port()
+    with (
+        serving("tcp://127.0.0.1:0") as server,
+        hearing(f"udp://127.0.0.1:{port}") as ear,
+        clients(server, 1) as (client,),
+    ):
+        senders, handle = server.senders, server.handles[0]
+        senders.send_to(parse_endpoint(f"udp://127.0.0.1:{port}"), [handle])
+        changed = stream(7, phasors=2, cfgcnt=1)
+        senders.replace(handle, served(changed))
+        client.say(encode_command(7, Command.SEND_CFG2))
+        server.until(lambda: len(client.hear()) == 1)
+        senders.announce()
+        ear.until(lambda: len(ear.messages) == 1)
+        assert ear.messages[0].config == changed
+        assert client.frames[0].data[14:][:-2] == ear.messages[0].frame.data[14:-2]
+        with pytest.raises(ValueError, match="is 7, not 8"):
+            senders.replace(handle, served(stream(8)))
+
+
+def test_frames_that_did_not_go_out_are_named() -> None:
+    with Senders(CLOCK) as senders:
+        stream_7 = senders.add(served(CONFIG))
+        assert senders.publish([(stream_7, b"to nobody")]) == []
+        senders.send_to(Endpoint(Scheme.UDP, "127.0.0.1", free_udp_port()), [stream_7])
+        assert senders.publish([(stream_7, b"1"), (stream_7, b"x" * 70_000), (stream_7, b"3")]) == [1]
+
+
+# --- time
+
+
+@paths
+def test_serving_until_a_deadline_is_exact_and_answers_meanwhile(native: bool) -> None:
+    with serving("tcp://127.0.0.1:0", native=native) as server, clients(server, 1) as (client,):
+        deadline_ns = CLOCK.monotonic_ns() + 60 * MS
+        client.say(encode_command(7, Command.SEND_CFG2))
+        while events := server.senders.serve_until(deadline_ns):
+            server.events += events
+        late_ns = CLOCK.monotonic_ns() - deadline_ns
+        assert 0 <= late_ns < 20 * MS
+        assert Outcome.ANSWERED in server.kinds()
+        assert len(client.hear()) == 1
+        passed_ns = CLOCK.monotonic_ns()
+        assert server.senders.serve_until(passed_ns - 1) == []
+
+
+def test_close_deadlines_still_let_clients_in() -> None:
+    """A player of thousands of streams always has a deadline within two milliseconds."""
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        client.say(encode_command(7, Command.SEND_CFG2))
+        deadline_ns = CLOCK.monotonic_ns()
+        end_ns = deadline_ns + PATIENCE_NS
+        while not client.hear():
+            deadline_ns = max(deadline_ns + MS // 2, CLOCK.monotonic_ns())
+            assert deadline_ns < end_ns
+            server.events += server.senders.serve_until(deadline_ns)
+
+
+def test_virtual_time_serves_too() -> None:
+    clock = VirtualClock()
+    with Senders(clock) as senders:
+        stream_7 = senders.add(served(CONFIG))
+        outlet = senders.listen(parse_endpoint("tcp://127.0.0.1:0"), [stream_7])
+        assert senders.local(outlet) is not None
+        while senders.serve_until(3600 * 10**9):
+            pass
+        assert clock.monotonic_ns() == 3600 * 10**9
+
+
+# --- mistakes
+
+
+def test_what_cannot_be_served_is_told() -> None:
+    with serving("tcp://127.0.0.1:0") as server:
+        senders = server.senders
+        with pytest.raises(SourceError, match="already in use; stop the other program"):
+            senders.listen(parse_endpoint(f"tcp://127.0.0.1:{server.address[1]}"), server.handles)
+        with pytest.raises(SettingsError, match="knows no commands; use udp\\+cmd://"):
+            senders.listen(parse_endpoint("udp://127.0.0.1:0"), server.handles)
+        with pytest.raises(SettingsError, match="use --listen"):
+            senders.send_to(parse_endpoint("tcp://127.0.0.1:4712"), server.handles)
+        with pytest.raises(SettingsError, match="port 0"):
+            senders.send_to(parse_endpoint("udp://127.0.0.1:0"), server.handles)
+        with pytest.raises(SourceError, match="unknown host"):
+            senders.send_to(parse_endpoint("udp://no.such.host.invalid:4713"), server.handles)
+        with pytest.raises(SourceError, match="does not have that address"):
+            senders.send_to(parse_endpoint("udp://127.0.0.1:4713?source=192.0.2.123"), server.handles)
+        twin = senders.add(served(replace(CONFIG, data_rate=30)))
+        with pytest.raises(SettingsError, match="two streams of IDCODE 7"):
+            senders.listen(parse_endpoint("tcp://127.0.0.1:0"), [*server.handles, twin])

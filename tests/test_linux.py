@@ -1,0 +1,148 @@
+"""System calls through ctypes: what they return, and that the tools live without them."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pmutools import linux
+from pmutools.net.sockets import Address, pack_sockaddr, unpack_sockaddr
+
+native = pytest.mark.skipif(not linux.NATIVE, reason="needs 64-bit Linux")
+
+
+def run_python(code: str, **environment: str) -> str:
+    """Output of ``code`` in a process of its own, so that its scheduling and locks are not ours."""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        env={**os.environ, **environment},
+        check=False,
+    )
+    assert not done.returncode, done.stderr
+    return done.stdout.strip()
+
+
+@native
+@pytest.mark.realtime
+def test_timer_slack_fifo_and_lock_either_work_or_say_why() -> None:
+    out = run_python(
+        "from pmutools import linux; import os\n"
+        "print(linux.timer_slack(1000), linux.fifo(5), linux.lock_memory(), sep='|')\n"
+        "print(open('/proc/self/timerslack_ns').read().strip(), os.sched_getscheduler(0) == os.SCHED_FIFO, sep='|')\n"
+        "print([line.split()[1] for line in open('/proc/self/status') if line.startswith('VmLck')][0])"
+    )
+    told, seen, locked = out.splitlines()
+    slack, fifo, lock = told.split("|")
+    slack_ns, is_fifo = seen.split("|")
+    assert slack == "None"
+    assert (fifo == "None") == (is_fifo == "True"), out
+    assert is_fifo == "True" or slack_ns == "1000"  # a real-time task has no slack
+    assert (lock == "None") == (int(locked) > 0), out
+    for reason in (fifo, lock):
+        assert reason == "None" or "for it" in reason
+
+
+def test_portable_by_environment() -> None:
+    out = run_python(
+        "from pmutools import linux; from pmutools.clock import SystemClock; c = SystemClock()\n"
+        "c.sleep_until(c.monotonic_ns() + 1_000_000)\n"
+        "print(linux.NATIVE, linux.clock_status(), linux.timer_slack(), linux.lock_memory())",
+        PMUTOOLS_PORTABLE="1",
+    )
+    assert out == "False None timer slack: only Linux has it memory lock: only Linux has it"
+
+
+@native
+def test_clock_status_is_plausible() -> None:
+    status = linux.clock_status()
+    assert status is not None
+    assert 0 <= status.state <= 5
+    assert 0 <= status.max_error_ns <= 17 * 10**9
+    assert abs(status.frequency_ppm) <= 500
+    assert abs(status.tai_s) < 100
+    assert status.synchronised == (status.state != 5 and not status.status & 0x40)
+
+
+@native
+@pytest.mark.realtime
+def test_absolute_sleep_wakes_for_signals_and_goes_on() -> None:
+    """A handler that returns must not end the sleep; one that raises must."""
+    out = run_python(
+        "import signal, time; from pmutools import linux\n"
+        "hits = []\n"
+        "signal.signal(signal.SIGALRM, lambda *_: hits.append(1))\n"
+        "signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)\n"
+        "start = time.monotonic_ns()\n"
+        "linux.sleep_until(start + 100_000_000)\n"
+        "print(time.monotonic_ns() - start >= 100_000_000, len(hits) > 2)\n"
+        "def stop(*_): raise KeyboardInterrupt\n"
+        "try:\n"
+        "    signal.signal(signal.SIGALRM, stop)\n"
+        "    linux.sleep_until(time.monotonic_ns() + 10_000_000_000)\n"
+        "except KeyboardInterrupt: print('stopped', time.monotonic_ns() - start < 5_000_000_000)"
+    )
+    assert out.splitlines() == ["True True", "stopped True"]
+
+
+def _pair(family: int, host: str) -> tuple[socket.socket, socket.socket]:
+    receiver, sender = (socket.socket(family, socket.SOCK_DGRAM) for _ in range(2))
+    receiver.bind((host, 0))
+    receiver.setblocking(False)
+    sender.bind((host, 0))
+    return receiver, sender
+
+
+@native
+@pytest.mark.realtime
+@pytest.mark.parametrize(("family", "host"), [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")])
+def test_batches_keep_order_bytes_senders_and_stamps(family: int, host: str) -> None:
+    receiver, sender = _pair(family, host)
+    receiver.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPNS, 1)
+    frames = [bytes([k % 256]) * (k % 90) for k in range(150)]
+    where = linux.SockAddr(pack_sockaddr(Address(family, receiver.getsockname())))
+    before_ns = time.time_ns()
+    assert linux.SendBatch(size=64).send(sender.fileno(), frames, [where] * len(frames)) == []
+    batch = linux.ReceiveBatch(size=40)
+    got = [datagram for _ in range(5) for datagram in batch.receive(receiver.fileno())]
+    after_ns = time.time_ns()
+    assert [datagram.data for datagram in got] == frames
+    assert {unpack_sockaddr(datagram.sockaddr) for datagram in got} == {Address(family, sender.getsockname())}
+    stamps = [datagram.stamp_ns for datagram in got if datagram.stamp_ns is not None]
+    assert len(stamps) > 100  # the first may come before the kernel has switched stamping on
+    assert all(before_ns <= stamp <= after_ns for stamp in stamps)
+    assert stamps == sorted(stamps)
+    receiver.close()
+    sender.close()
+
+
+@native
+@pytest.mark.realtime
+def test_a_failed_datagram_is_named_and_the_rest_go_out() -> None:
+    receiver, sender = _pair(socket.AF_INET, "127.0.0.1")
+    good = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, receiver.getsockname())))
+    port_0 = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, ("127.0.0.1", 0))))
+    frames = [b"0", b"1", b"x" * 70_000, b"3", b"4"]
+    assert linux.SendBatch().send(sender.fileno(), frames, [good, port_0, good, good, port_0]) == [1, 2, 4]
+    assert [datagram.data for datagram in linux.ReceiveBatch().receive(receiver.fileno())] == [b"0", b"3"]
+    receiver.close()
+    sender.close()
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        Address(socket.AF_INET, ("192.0.2.7", 4713)),
+        Address(socket.AF_INET6, ("2001:db8::7", 4713, 0, 0)),
+        Address(socket.AF_INET6, ("fe80::1", 65535, 0, 3)),
+    ],
+)
+def test_kernel_addresses_there_and_back(address: Address) -> None:
+    assert unpack_sockaddr(pack_sockaddr(address)) == address
