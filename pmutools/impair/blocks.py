@@ -53,9 +53,8 @@ class Blocks(Generic[T_co]):
         if self._chain.memory:
             anchor = index - (index + self._phase) % ANCHOR
             following = self._first + len(self._values)
-            if first == anchor or not self._values or not anchor < following <= first:
+            if not (self._values and anchor < following <= first):
                 following = anchor
-            if following == anchor:
                 self._chain.begin(anchor)
             for start in range(following, first, BLOCK):
                 self._chain.run(start, BLOCK)

@@ -117,7 +117,7 @@ def profile_of_options(options: Iterable[tuple[str, str]], read: ReadText | None
         if (pattern, option) in seen and not value.startswith("+"):
             value = f"+{value}"
         seen.add((pattern, option))
-        rules.append(StreamRule(_patterns(pattern), (_setting(option, Entry(value, where), read),)))
+        rules.append(StreamRule(_patterns(pattern), (_read_setting(option, Entry(value, where), read),)))
     return Profile(tuple(rules))
 
 
@@ -136,7 +136,11 @@ def parse_action(text: str, read: ReadText | None = None) -> Action:
         match = _FAULT.fullmatch(rest)
         if match is None:
             raise ValueError(f"{text!r} is not of the form 'fault NAME OPTION=VALUE'")
-        setting = _setting(match[3].lower(), Entry(match[4], Where("fault", key=match[3].lower())), read)
+        option = match[3].lower()
+        try:
+            setting = _setting(option, match[4], read)
+        except ValueError as error:
+            raise ValueError(f"{option}: {error}") from None
         return Action(verb, StreamRule(_patterns(match[1] or match[2]), (setting,)))
     if verb in PLAYER_VERBS:
         return Action(verb, argument=rest)
@@ -158,14 +162,18 @@ def _patterns(text: str) -> tuple[str, ...]:
 
 
 def _rule(section: Section, read: ReadText | None) -> StreamRule:
-    settings = tuple(_setting(option, entry, read) for option, entry in section.entries.items())
+    settings = tuple(_read_setting(option, entry, read) for option, entry in section.entries.items())
     return StreamRule(_patterns(section.argument), settings)
 
 
-def _setting(option: str, entry: Entry, read: ReadText | None) -> tuple[str, Setting]:
+def _read_setting(option: str, entry: Entry, read: ReadText | None) -> tuple[str, Setting]:
+    return entry.read(lambda text: _setting(option, text, read))
+
+
+def _setting(option: str, text: str, read: ReadText | None) -> tuple[str, Setting]:
     if option not in OPTIONS:
-        raise entry.where.error(f"no such fault; {suggestion(option, OPTIONS)}")
-    return option, entry.read(lambda text: parse_setting(option, _with_files(text, read)))
+        raise ValueError(f"no such fault; {suggestion(option, OPTIONS)}")
+    return option, parse_setting(option, _with_files(text, read))
 
 
 def _with_files(text: str, read: ReadText | None) -> str:

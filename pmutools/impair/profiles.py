@@ -22,9 +22,10 @@ delay = normal(44, 1.3, min=40, max=48) + constant(15) + lognormal(1, 1.5, max=2
 delay = +truncnormal(8.3, 5, 0, 16.6)
 """,
     "two-zero": """
-; Figs. 11 and 15: two frames in one 60 Hz window of the controller, none in the next.
+; Figs. 11 and 15: two frames in one 60 Hz window of the controller, none in the next. Each pair arrives 24.5 and
+; 24.7 ms after the first one's stamp: in the middle of a window, where windows begin with the stamps.
 [stream *]
-delay = +trace(16.6, 0)
+delay = +trace(24.5, 8)
 """,
     "asymmetry-3": """
 ; Figs. 13 and 14: the south 3 samples (50 ms) behind the north, on top of any other delay.

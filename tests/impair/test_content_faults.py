@@ -145,6 +145,11 @@ def test_repeated_stamp() -> None:
     assert row.data == frame(0) and row.faults == ""
 
 
+def test_a_frame_cut_short_is_no_model_for_the_next() -> None:
+    rows = corrupted("truncate(10) when=2\nrepeat when=3", 4)
+    assert decode_data(rows[3].data, CONFIG).time_ns == decode_data(frame(1), CONFIG).time_ns
+
+
 def test_quality() -> None:
     (row,) = corrupted("quality(0x4F)")
     assert decode_data(row.data, CONFIG).time_quality == 0x4F
