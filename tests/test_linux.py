@@ -125,6 +125,20 @@ def test_batches_keep_order_bytes_senders_and_stamps(family: int, host: str) -> 
 
 @native
 @pytest.mark.realtime
+def test_one_batch_serves_sockets_of_both_families() -> None:
+    """The kernel shortens the room for addresses to what the last one took; it must be given anew."""
+    batch = linux.ReceiveBatch()
+    for family, host in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")):
+        receiver, sender = _pair(family, host)
+        sender.sendto(b"x", receiver.getsockname())
+        (datagram,) = batch.receive(receiver.fileno())
+        assert unpack_sockaddr(datagram.sockaddr) == Address(family, sender.getsockname())
+        receiver.close()
+        sender.close()
+
+
+@native
+@pytest.mark.realtime
 def test_a_failed_datagram_is_named_and_the_rest_go_out() -> None:
     receiver, sender = _pair(socket.AF_INET, "127.0.0.1")
     good = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, receiver.getsockname())))

@@ -46,8 +46,15 @@ class Plumbing(NamedTuple):
 class CommandLink:
     """One commanded endpoint, from the client's side.
 
-    ``owners`` are the places of this endpoint in the user's list, ``table`` and ``timing`` those of the role. Raises
-    SourceError for an unknown host; a server that cannot be reached now is news, and tried again later.
+    ``owners`` are the places of this endpoint in the user's list, ``table`` and ``timing`` those of the role. A server
+    that cannot be reached now is news, and tried again later.
+
+    Raises
+    ------
+    SourceError
+        The host is unknown.
+    SettingsError
+        Port 0, or an ``iface`` that is no local address.
     """
 
     def __init__(
@@ -60,6 +67,8 @@ class CommandLink:
         self.plumbing = plumbing
         self.dialogue = Dialogue(ClientRole(table, timing), plumbing.reactor, self._tell, self._act)
         self._over_tcp = endpoint.scheme is not Scheme.UDP_COMMANDED
+        if not endpoint.port:
+            raise SettingsError(f"{endpoint}: port 0 is nowhere to connect to")
         self.address = resolve(endpoint.host, endpoint.port, datagram=not self._over_tcp)
         self._local = _local(endpoint.iface, self._over_tcp)
         self._transport: TcpClient | UdpSocket | None = None

@@ -15,7 +15,7 @@ from pmutools.c37118.framer import Frame, Framer
 from pmutools.c37118.session import Outcome, Served, ServerRole
 from pmutools.flow import Chunk
 from pmutools.net.audience import Audience, Flushable, Outbox, Sink, UdpSink
-from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.net.endpoint import Endpoint, Scheme, scoped
 from pmutools.net.reactor import READ, WRITE, Reactor
 from pmutools.net.sockets import Address, explain, resolve
 from pmutools.net.tcp import TcpListener, TcpPeer
@@ -60,8 +60,8 @@ class Stage(NamedTuple):
     audience: Audience
     tell: Callable[[ServerEvent], None]
     dirty: list[Flushable]
-    outbox: Callable[[int], Outbox]
-    """The box of the socket that sends data to addresses of a family."""
+    outbox: Callable[[Address, Endpoint], Outbox]
+    """The box of the socket that sends to an address, in the way an endpoint asks for."""
     batches: Batches | None
     native: bool = linux.NATIVE
 
@@ -278,9 +278,9 @@ class TcpOutlet(Outlet):
         client = _TcpClient(peer, ServerRole(self.streams), self)
         if self.endpoint.scheme is Scheme.TCP_UDP:
             host, port = self.endpoint.data_host or peer.address.host, self.endpoint.data_port or 0
-            address = resolve(host, port, datagram=True)
+            address = resolve(scoped(host, self.endpoint.iface), port, datagram=True)
             client.key = address
-            client.sink = lambda: UdpSink(self.stage.outbox(address.family), target(address))
+            client.sink = lambda: UdpSink(self.stage.outbox(address, self.endpoint), target(address))
         self._clients.add(client)
         self.watch(client, READ)
         self._tell(ServerKind.CONNECTED, peer.address)

@@ -118,8 +118,9 @@ class Receivers:
         self._reactor = Reactor(clock)
         self._plumbing = Plumbing(self._reactor, self._out.append, Batches() if native else None, native, {})
         self._listeners: dict[tuple[str, int], _Listener] = {}
+        self._by_local: dict[str, _Listener] = {}
+        """By the destination of the flows that come in through them."""
         self._links: list[CommandLink] = []
-        self._origins: dict[Flow, _Listener] = {}
         self._routes: dict[Flow, dict[int, Route | None]] = {}
         self._streams = 0
         self._held: dict[tuple[Flow, int], int] = {}
@@ -223,6 +224,7 @@ class Receivers:
             )
             listener = _Listener(sock)
             self._listeners[host, port or sock.address.port] = listener
+            self._by_local[str(sock.address)] = listener
             self._reactor.watch(sock, READ, lambda _, heard=listener: self._read(heard))  # type: ignore[misc]
         if is_multicast(host):
             listener.sock.join(host, iface=endpoint.iface, source=source)
@@ -246,12 +248,7 @@ class Receivers:
             chunks = listener.sock.read()
         except OSError:  # an ICMP error to something sent from here earlier (Windows): nothing was received
             return
-        for chunk in chunks:
-            if chunk.flow not in self._origins:
-                if len(self._origins) >= MAX_STREAMS:
-                    self._forget_unwanted()
-                self._origins[chunk.flow] = listener
-            self._out.append(chunk)
+        self._out += chunks
 
     def _route(self, flow: Flow, idcode: int) -> Route | None:
         routes = self._routes.get(flow)
@@ -269,10 +266,11 @@ class Receivers:
         return route
 
     def _new_route(self, flow: Flow, idcode: int) -> Route | None:
-        listener = self._origins.get(flow)
-        if listener is None:
-            link = self._plumbing.links.get(flow)
-            return None if link is None else self._link_route(link, link.owners, flow, idcode)
+        if link := self._plumbing.links.get(flow):
+            return self._link_route(link, link.owners, flow, idcode)
+        listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
+        if listener is None:  # a connection that has ended meanwhile
+            return None
         host = flow.source.rpartition(":")[0].strip("[]")
         owners = tuple(
             index
@@ -328,7 +326,6 @@ class Receivers:
             routes = self._routes[flow]
             if not any(routes.values()):
                 self._streams -= len(self._routes.pop(flow))
-        self._origins = {flow: listener for flow, listener in self._origins.items() if flow in self._routes}
 
     # --- telling
 

@@ -71,7 +71,7 @@ class Senders:
         self._events: list[ServerEvent] = []
         self._dirty: list[Flushable] = []
         self._stage = Stage(
-            self._reactor, self._audience, self._events.append, self._dirty, self._data_box, self._batches, native
+            self._reactor, self._audience, self._events.append, self._dirty, self._box, self._batches, native
         )
         self._served: list[Served] = []
         self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
@@ -121,9 +121,7 @@ class Senders:
         if not endpoint.port:
             raise SettingsError(f"{endpoint}: port 0 is nowhere to send to")
         where = target(resolve(scoped(endpoint.host, endpoint.iface), endpoint.port, datagram=True))
-        group = is_multicast(where.address.host)
-        local = endpoint.source or ("::" if where.address.family == socket.AF_INET6 else "0.0.0.0")
-        box = self._box(local, endpoint.iface if group else None, endpoint.ttl)
+        box = self._box(where.address, endpoint)
         for handle in streams:
             sink = UdpSink(box, where)
             self._audience.sinks[handle].append(sink)
@@ -240,16 +238,17 @@ class Senders:
             failed += self._dirty.pop().flush()
         return failed
 
-    def _box(self, local: str, iface: str | None, ttl: int | None) -> Outbox:
-        box = self._boxes.get((local, iface, ttl))
+    def _box(self, where: Address, endpoint: Endpoint) -> Outbox:
+        """The box of the socket for ``where``: one for all that leave from the same address in the same way."""
+        local = endpoint.source or ("::" if where.family == socket.AF_INET6 else "0.0.0.0")
+        group = is_multicast(where.host)
+        way = (local, endpoint.iface if group else None, endpoint.ttl if group else None)
+        box = self._boxes.get(way)
         if box is None:
             sock = UdpSocket(local, 0, rcvbuf_bytes=_SENDING_RCVBUF, batches=self._batches, native=self._native)
-            sock.send_via(iface=iface, ttl=ttl)
-            box = self._boxes[local, iface, ttl] = Outbox(sock, self._dirty)
+            sock.send_via(iface=way[1], ttl=way[2])
+            box = self._boxes[way] = Outbox(sock, self._dirty)
         return box
-
-    def _data_box(self, family: int) -> Outbox:
-        return self._box("::" if family == socket.AF_INET6 else "0.0.0.0", None, None)
 
     def _announce_share(self) -> None:
         self.announce(range(self._share, len(self._served), _SHARES))

@@ -38,15 +38,16 @@ class Address(NamedTuple):
 
 
 def resolve(host: str, port: int, *, datagram: bool, family: int = socket.AF_UNSPEC) -> Address:
-    """The first address of ``host``; raises SourceError where there is none. May ask a name server, and wait for it."""
+    """An address of ``host``, IPv4 where it has one (``localhost`` is then the same to both ends).
+
+    Raises SourceError where there is none. A name may have to be asked for, which may take its time.
+    """
     kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
     try:
         found = socket.getaddrinfo(host, port, socket.AddressFamily(family), kind)
     except (OSError, UnicodeError):
-        raise SourceError(
-            f"{join_host(host, port)}: unknown host {host!r}; check the name, or give an address"
-        ) from None
-    numeric, sockaddr = found[0][0], found[0][4]
+        raise SourceError(f"{join_host(host, port)}: unknown host {host!r}; check it, or give an address") from None
+    numeric, _, _, _, sockaddr = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return Address(numeric, (str(sockaddr[0]), *sockaddr[1:]))
 
 

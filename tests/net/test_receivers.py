@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import groupby
 
 import pytest
 from support.live import CLOCK, Ear, data_frame, free_udp_port, stream, values
@@ -17,14 +18,14 @@ from pmutools.c37118 import Command, FrameType, StreamConfig, decode_command, en
 from pmutools.c37118.session import Timing
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import StampSource
-from pmutools.net import receiver
+from pmutools.net import link, receiver
 from pmutools.net.dialogue import LinkKind
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.receiver import Receivers
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
-QUICK = Timing(answer_ns=60 * MS, silence_ns=80 * MS, silence_frames=1, tries=3)
+QUICK = Timing(answer_ns=120 * MS, silence_ns=150 * MS, silence_frames=1, tries=3)
 paths = pytest.mark.parametrize("native", [linux.NATIVE, False], ids=["native", "portable"])
 
 
@@ -96,8 +97,8 @@ def device() -> Iterator[Device]:
 
 
 def hears(device: Device, *commands: int) -> Callable[[], bool]:
-    """Whether the device has heard just these commands."""
-    return lambda: device.poll() and device.commands == list(commands)
+    """Whether the device has heard these commands; requests repeated on a busy machine count once."""
+    return lambda: device.poll() and [command for command, _ in groupby(device.commands)] == list(commands)
 
 
 def play(device: Device, ear: Ear, config: StreamConfig, count: int = 3) -> None:
@@ -126,12 +127,13 @@ def test_data_before_the_configuration_are_held_then_given(sender: socket.socket
         ear.until(lambda: len(ear.chunks) == 3)
         assert ear.messages == []
         assert [event.idcode for event in ear.of(LinkKind.NO_CONFIG)] == [7]
-        sender.sendto(encode_config(config), address.sockaddr)
-        sender.sendto(data_frame(config, 10**10, value=3), address.sockaddr)
-        ear.until(lambda: values(ear.messages) == [0, 1, 2, 3])
+        for frame in (encode_config(config), data_frame(config, 10**10, value=3), encode_config(config)):
+            sender.sendto(frame, address.sockaddr)
+        ear.until(lambda: len(ear.messages) == 6)
+        assert values(ear.messages) == [0, 1, 2, 3]
         assert {message.config for message in ear.messages} == {config}
         assert ear.kinds == [LinkKind.BOUND, LinkKind.NO_CONFIG, LinkKind.CONFIGURED, LinkKind.STREAMING]
-        assert ear.messages[-1].frame.stamp_source is (StampSource.KERNEL if native else StampSource.USER)
+        assert ear.messages[-2].frame.stamp_source is (StampSource.KERNEL if native else StampSource.USER)
         flow = ear.messages[0].flow
         assert ear.receivers.owners(flow, 7) == (0,)
 
@@ -209,10 +211,11 @@ def test_own_drops_are_told_apart_from_network_loss(monkeypatch: pytest.MonkeyPa
     with ears("udp://127.0.0.1:0", rcvbuf_bytes=4096) as ear:
         address = ear.receivers.local(0)
         assert address is not None
-        for k in range(300):
-            sender.sendto(data_frame(stream(7), k * 10**9), address.sockaddr)
-        ear.until(lambda: len(ear.chunks) + sum(event.datagrams for event in ear.news) == 300)
-        assert ear.of(LinkKind.OWN_DROPS)
+        for sent in (300, 600):
+            for k in range(300):
+                sender.sendto(data_frame(stream(7), k * 10**9), address.sockaddr)
+            ear.until(lambda sent=sent: len(ear.chunks) + sum(event.datagrams for event in ear.news) == sent)  # type: ignore[misc]
+        assert len(ear.of(LinkKind.OWN_DROPS)) >= 2
 
 
 def test_garbage_is_counted_and_does_no_harm(sender: socket.socket) -> None:
@@ -235,10 +238,11 @@ def test_a_flood_of_senders_is_forgotten_again(monkeypatch: pytest.MonkeyPatch, 
     with ears("udp://127.0.0.1:0?idcode=7") as ear:
         address = ear.receivers.local(0)
         assert address is not None
-        sender.sendto(encode_config(stream(7)), address.sockaddr)
-        for idcode in range(100, 200):
-            sender.sendto(encode_config(stream(idcode)), address.sockaddr)
-        sender.sendto(data_frame(stream(7), 10**9, value=5), address.sockaddr)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as flood:
+            for idcode in range(100, 200):
+                flood.sendto(encode_config(stream(idcode)), address.sockaddr)
+        for frame in (encode_config(stream(7)), data_frame(stream(7), 10**9, value=5)):
+            sender.sendto(frame, address.sockaddr)
         ear.until(lambda: len(ear.chunks) == 102)
         assert values(ear.messages) == [5]
         assert sum(map(len, ear.receivers._routes.values())) <= 20
@@ -299,7 +303,8 @@ def test_an_idcode_not_given_is_learnt(device: Device) -> None:
         ear.until(hears(device, Command.SEND_CFG2))
         assert decode_command(device.heard[:18]).prefix.idcode == 1
         device.say(data_frame(config, 10**9, value=1))
-        ear.until(hears(device, Command.SEND_CFG2, Command.SEND_CFG2))
+        ear.until(lambda: device.poll() and len(device.heard) == 36)
+        assert device.commands == [Command.SEND_CFG2] * 2
         assert decode_command(device.heard[18:36]).prefix.idcode == 33
         device.say(encode_config(config))
         ear.until(lambda: values(ear.messages) == [1])
@@ -339,6 +344,22 @@ def test_a_refused_connection_is_told_and_tried_again() -> None:
         device = Device(port)
         play(device, ear, stream(7))
     device.close()
+
+
+def test_a_host_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A listener whose queue is full drops what knocks, like a firewall."""
+    monkeypatch.setattr(link, "CONNECT_NS", 50 * MS)
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full:
+        address = full.getsockname()
+        knocking = [socket.socket() for _ in range(3)]
+        for sock in knocking:
+            sock.setblocking(False)
+            sock.connect_ex(address)
+        with ears(f"tcp://127.0.0.1:{address[1]}?idcode=7") as ear:
+            ear.until(lambda: LinkKind.FAILED in ear.kinds)
+            assert "no connection within" in ear.news[0].detail
+        for sock in knocking:
+            sock.close()
 
 
 @paths
@@ -438,6 +459,8 @@ def test_what_cannot_be_opened_is_told_before_anything_runs() -> None:
         with pytest.raises(SourceError, match="already in use"), ears("udp://127.0.0.1:0", f"udp://{address}"):
             pass
     with pytest.raises(SourceError, match="unknown host"), ears("tcp://no.such.host.invalid:4712"):
+        pass
+    with pytest.raises(SettingsError, match="port 0 is nowhere"), ears("tcp://127.0.0.1:0"):
         pass
     with pytest.raises(SettingsError, match="iface"), ears("tcp://127.0.0.1:4712?iface=eth0"):
         pass

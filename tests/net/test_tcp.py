@@ -6,6 +6,7 @@ import random
 import socket
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import pytest
 from support.live import data_frame, stream
@@ -17,6 +18,9 @@ from pmutools.flow import Chunk, StampSource
 from pmutools.net import tcp
 from pmutools.net.sockets import Address
 from pmutools.net.tcp import TcpClient, TcpListener, TcpPeer
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 pytestmark = pytest.mark.realtime
 CONFIG = stream()
@@ -143,16 +147,38 @@ def test_a_client_that_does_not_read_loses_frames_whole_and_memory_is_bounded() 
     close(listener, client, peer)
 
 
+class Scripted(socket.socket):
+    """A socket that takes as many bytes, send by send, as its script says."""
+
+    def __init__(self, *takes: int) -> None:
+        super().__init__()
+        self.takes = list(takes)
+
+    def send(self, data: ReadableBuffer, flags: int = 0, /) -> int:
+        if not (take := self.takes.pop(0)):
+            raise BlockingIOError
+        return min(take, len(memoryview(data)))
+
+
 def test_a_stall_is_judged_by_progress() -> None:
-    listener, client, peer = connected(queue_bytes=16_384)
-    now_ns = 0
-    while not peer.queued_bytes:
-        peer.put(b"x" * 1000, now_ns)
+    sock = Scripted(30, 0, 10, 0, 0, 1000)
+    peer = TcpPeer(sock, Address(socket.AF_INET, ("192.0.2.1", 1)), Address(socket.AF_INET, ("192.0.2.2", 2)))
+    assert peer.put(b"x" * 100, 0)
+    assert peer.queued_bytes == 70
+    peer.flush(1000)
     assert not peer.stalled(tcp.STALL_NS)
     assert peer.stalled(tcp.STALL_NS + 1)
-    wait(lambda: (client.read(), peer.flush(tcp.STALL_NS), not peer.queued_bytes)[-1])
+    peer.flush(2000)  # ten bytes more
+    assert peer.queued_bytes == 60
+    assert not peer.stalled(tcp.STALL_NS + 2000)
+    assert peer.stalled(tcp.STALL_NS + 2001)
+    peer.put(b"y" * 10, 3000)
+    assert peer.stalled(tcp.STALL_NS + 2001)  # what is added is no progress
+    peer.flush(4000)
+    peer.flush(5000)
+    assert not peer.queued_bytes
     assert not peer.stalled(10 * tcp.STALL_NS)
-    close(listener, client, peer)
+    peer.close()
 
 
 def test_ends_of_connections_are_told_apart() -> None:
