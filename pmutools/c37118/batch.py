@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from pmutools.flow import StampSource
 NO_TIME = np.iinfo(np.int64).min
 """``arrival_ns`` of a frame whose arrival nobody saw."""
 STAMP_SOURCES = tuple(StampSource)
-_BLOCK_BYTES = 1 << 18
+_BLOCK_BYTES = 1 << 19
 """Frames are converted in pieces of about this size, which stay in the processor's cache."""
 
 
@@ -111,8 +112,6 @@ def decode_batch(
     """
     wire = frames if isinstance(frames, np.ndarray) else wire_view(frames, config)
     count, layout = len(wire), layout_of(config)
-    if check:
-        _check(wire, config)
     batch = Batch(
         config,
         timebase.to_ns_array(wire["soc"], wire["fracsec"] & np.uint32(0xFFFFFF), config.time_base),
@@ -130,11 +129,15 @@ def decode_batch(
     )
     step = max(1, _BLOCK_BYTES // config.frame_size)
     for first in range(0, count, step):
-        _fill(batch, slice(first, first + step))
+        rows = slice(first, first + step)
+        if check:
+            _check(wire[rows], config, first)
+        _fill(batch, rows)
     return batch
 
 
-def _check(wire: npt.NDArray[np.void], config: StreamConfig) -> None:
+def _check(wire: npt.NDArray[np.void], config: StreamConfig, first: int) -> None:
+    """Hold CHK and prefix of a piece of rows that begins at frame ``first``."""
     size = config.frame_size
     octets = np.ascontiguousarray(wire).view(np.uint8).reshape(-1, size)
     if (chks := chk_array(octets)).any():
@@ -148,7 +151,7 @@ def _check(wire: npt.NDArray[np.void], config: StreamConfig) -> None:
         & (wire["idcode"] == config.idcode)
     )
     if not right.all():
-        raise ConfigError(f"frame {int(np.argmin(right))} is no data frame of stream {config.idcode}")
+        raise ConfigError(f"frame {first + int(np.argmin(right))} is no data frame of stream {config.idcode}")
 
 
 def _blocks(wire: npt.NDArray[np.void], run: Run) -> npt.NDArray[np.void]:
@@ -173,8 +176,7 @@ def _fill(batch: Batch, rows: slice) -> None:
             _scale_frequency(frequency[:, columns], head.fnom_hz, 1000)
             _scale_frequency(rocof[:, columns], 0.0, 100)
         if "phasors" in names:
-            # one plain copy first: casting is fast only over contiguous memory
-            _phasors(parts[:, run.phasors], np.ascontiguousarray(blocks["phasors"]), layout.phasors[run.phasors])
+            _phasors(parts[:, run.phasors], _pairs(wire, run), layout.phasors[run.phasors])
         if "analogs" in names:
             out = batch.analogs[rows, run.analogs]
             out[...] = blocks["analogs"].reshape(out.shape)
@@ -187,9 +189,10 @@ def _fill(batch: Batch, rows: slice) -> None:
     good = (stat & STAT_DATA_ERROR_MASK) == 0
     unknown = np.isnan(frequency)
     if unknown.any():  # then only phasors can make it valid
-        for row, number in np.argwhere(good & unknown):
+        for number in np.flatnonzero(unknown.any(0)).tolist():
             of_station = layout.slots[number].phasor_columns
-            good[row, number] = not np.isnan(batch.phasors[rows][row, of_station.start : of_station.stop]).all()
+            absent = np.isnan(batch.phasors[rows, of_station.start : of_station.stop]).all(1)
+            good[:, number] &= ~(unknown[:, number] & absent)
     batch.valid[rows] = good
 
 
@@ -202,35 +205,55 @@ def _scale_frequency(column: npt.NDArray[np.float64], base: float, counts: int) 
         column[absent] = np.nan
 
 
+_PAIRS = {"ff": ">f4", "hh": ">i2", "Hh": ">u2"}
+
+
+def _pairs(wire: npt.NDArray[np.void], run: Run) -> npt.NDArray[Any]:
+    """The phasors of a run of stations as sent, (N, R*P, 2), native float32, int16 or (integer polar) uint16."""
+    field = next(field for field in run.fields if field.name == "phasors")
+    strides = (wire.strides[0], run.size)
+    octets = np.ndarray((len(wire), run.stations), f"V{field.size}", wire, field.offset, strides)
+    # opaque bytes are gathered fastest, and only what is contiguous is swapped fast
+    pairs = np.ascontiguousarray(octets).view(_PAIRS[field.code])
+    return pairs.astype(pairs.dtype.newbyteorder("=")).reshape(len(wire), -1, 2)
+
+
+@cache
+def _unit_phasors() -> npt.NDArray[np.complex128]:
+    """exp(jθ) of every integer angle, by its count as uint16; NaN for the filler."""
+    angle = np.arange(1 << 16, dtype=np.uint16).view(np.int16) * RAD_PER_COUNT
+    unit: npt.NDArray[np.complex128] = np.cos(angle) + 1j * np.sin(angle)
+    unit[INT16_FILLER] = complex(np.nan, np.nan)
+    return unit
+
+
 def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], slots: Sequence[PhasorSlot]) -> None:
-    """Wire phasors (N, R, P) of alike stations into ``out`` (N, R*P, 2), as real and imaginary parts in SI units."""
+    """Wire phasors of alike stations into ``out`` (N, R*P, 2), as real and imaginary parts in SI units."""
     factor = np.array([slot.factor for slot in slots])
     turn = np.array([slot.angle_offset_rad for slot in slots])
-    floating, count = slots[0].floating, len(out)
+    floating, first, second = slots[0].floating, raw[..., 0], raw[..., 1]
     if slots[0].polar:
-        if floating:
-            pairs = raw.reshape(count, -1, 2)
-            magnitude, angle, absent = pairs[..., 0].astype(float), pairs[..., 1].astype(float), None
-        else:
-            raw = raw.reshape(count, -1)
-            magnitude, counts = raw["mag"].astype(float), raw["angle"]
-            angle, absent = counts * RAD_PER_COUNT, counts == INT16_FILLER
-        magnitude *= factor
-        angle -= turn
         with np.errstate(invalid="ignore"):  # an infinite angle or 0 * inf: NaN is the answer
-            np.multiply(magnitude, np.cos(angle), out=out[..., 0])
-            np.multiply(magnitude, np.sin(angle), out=out[..., 1])
-    else:
-        out[...] = raw.reshape(out.shape)
-        absent = None if floating else (out == INT16_FILLER).all(-1)
-        if (factor != 1).any():
-            out *= factor[:, None]
-        if turn.any():
-            turned = out[..., 0] + 1j * out[..., 1]
-            turned *= np.exp(-1j * turn)
-            out[..., 0], out[..., 1] = turned.real, turned.imag
-    if absent is not None and absent.any():
-        out[absent] = np.nan
+            if floating:
+                angle = second - turn
+                cosine, sine = np.cos(angle), np.sin(angle)
+            else:
+                unit = _unit_phasors().take(second)
+                if turn.any():
+                    unit *= np.exp(-1j * turn)
+                cosine, sine = unit.real, unit.imag
+            magnitude = first * factor
+            np.multiply(magnitude, cosine, out=out[..., 0])
+            np.multiply(magnitude, sine, out=out[..., 1])
+        return
+    out[...] = raw
+    if not floating:
+        out[(first == INT16_FILLER) & (second == INT16_FILLER)] = np.nan
+    if (factor != 1).any():
+        out *= factor[:, None]
+    if turn.any():
+        turned = (out[..., 0] + 1j * out[..., 1]) * np.exp(-1j * turn)
+        out[..., 0], out[..., 1] = turned.real, turned.imag
 
 
 def encode_batch(batch: Batch) -> tuple[npt.NDArray[np.uint8], int]:

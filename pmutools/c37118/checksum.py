@@ -5,7 +5,9 @@ Its check value over ``b"123456789"`` is 0x29B1. Over a whole frame, CHK include
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
+from itertools import starmap
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -32,5 +34,5 @@ def chk_array(frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     import numpy as np
 
     count, size = frames.shape
-    flat = np.ascontiguousarray(frames).tobytes()
-    return np.fromiter((chk(flat[at : at + size]) for at in range(0, count * size, size)), np.uint16, count)
+    rows = struct.iter_unpack(f"{size}s", np.ascontiguousarray(frames).data)  # N bytes objects at little cost
+    return np.fromiter(starmap(chk, rows), np.uint16, count)
