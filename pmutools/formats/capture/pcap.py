@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.formats.capture.records import LOOK, MAX_PACKET, Ints, Records, Verdict, gather, read_records
+from pmutools.formats.capture.records import LOOK, MAX_PACKET, RUN, Ints, Records, Verdict, gather, read_records
 from pmutools.formats.capture.tally import Tally
 from pmutools.formats.capture.window import Window
 from pmutools.timebase import NS
@@ -71,12 +71,12 @@ class _Pcap:
         self._units = NS // self.unit_ns
         self._last_s: int | None = None
 
-    def run(self, data: bytes) -> tuple[Records, int]:
+    def run(self, data: bytes, pos: int) -> tuple[Records, int]:
         """The chain of lengths is followed first, blindly, and then cut at the first implausible header."""
         size, length = self.size, self._length
         chain: list[int] = []
-        pos, last = 0, len(data) - size
-        while pos <= last:
+        last = len(data) - size
+        while pos <= last and len(chain) <= RUN:
             chain.append(pos)
             pos += size + length(data, pos + 8)[0]
         heads = gather(data, np.array(chain, np.int64), self._layout)
@@ -87,7 +87,8 @@ class _Pcap:
         count = int(np.argmin(followed)) if not followed.all() else len(followed)
         if count:
             self._last_s = int(seconds[count - 1])
-        return self._records(data, np.array(chain[:count], np.int64), heads[:count]), chain[count] if chain else 0
+        records = self._records(data, np.array(chain[:count], np.int64), heads[:count])
+        return records, chain[count] if chain else pos
 
     def _records(self, data: bytes, positions: Ints, heads: npt.NDArray[Any]) -> Records:
         start = positions + self.size

@@ -18,6 +18,7 @@ from pmutools.formats.capture.records import (
     LOOK,
     MAX_PACKET,
     NO_STAMP,
+    RUN,
     Ints,
     Records,
     Verdict,
@@ -98,14 +99,13 @@ class _Pcapng:
         fields = ("kind", "length", "interface", "high", "low", "captured", "wire_length")
         self._layout = np.dtype([(name, order + "u4") for name in fields])
 
-    def run(self, data: bytes) -> tuple[Records, int]:
-        # The last block has no next to look at in one go with its closing length; the layout reaches beyond short ones.
-        padded = data + bytes(self._layout.itemsize)
+    def run(self, data: bytes, pos: int) -> tuple[Records, int]:
+        """A section's and an interface's description end the run, lest packets before them be read by it."""
         positions: list[int] = []
+        size = len(data)
         seam = self._seam
-        pos, size = 0, len(data)
-        kind, length = self._head(padded, pos)
-        while size - pos >= 12:
+        kind, length = self._head(data, pos) if size - pos >= 12 else (0, 0)
+        while size - pos >= 12 and len(positions) < RUN:
             if kind == SECTION_HEADER:
                 if positions:
                     break
@@ -114,7 +114,10 @@ class _Pcapng:
             stop = pos + length
             if length & 3 or not 12 <= length <= MAX_BLOCK or stop > size:
                 break
-            closing, next_kind, next_length = seam(padded, stop - 4)
+            # The closing length and the next block's head in one go.
+            closing, next_kind, next_length = (
+                seam(data, stop - 4) if stop + 8 <= size else seam(data[stop - 4 : stop] + bytes(8))
+            )
             if closing != length:
                 break
             if kind in _WITH_PACKET:
@@ -126,11 +129,12 @@ class _Pcapng:
             elif kind not in _KNOWN:
                 self._tally.unknown_blocks += 1
             pos, kind, length = stop, next_kind, next_length
-        return self._records(padded, np.array(positions, np.int64)), pos
+        return self._records(data, np.array(positions, np.int64)), pos
 
     def _records(self, data: bytes, positions: Ints) -> Records:
         """The packets of the packet blocks at ``positions``."""
-        heads = gather(data, positions, self._layout)
+        short = len(data) - int(positions[-1]) < self._layout.itemsize if len(positions) else False
+        heads = gather(data + bytes(self._layout.itemsize) if short else data, positions, self._layout)
         kind, number = heads["kind"], heads["interface"].astype(np.int64)
         simple, obsolete = kind == SIMPLE_PACKET, kind == PACKET
         # The obsolete block has a 16-bit interface number and a drop count in the same place.
@@ -138,12 +142,14 @@ class _Pcapng:
         interfaces = self.interfaces or [_UNKNOWN]
         unknown = number >= len(self.interfaces)
         number[unknown] = 0
-        linktype = np.where(unknown, NO_INTERFACE, np.array([each.linktype for each in interfaces])[number])
+        linktype = np.full(len(positions), NO_INTERFACE)
         ticks = heads["high"].astype(np.uint64) << np.uint64(32) | heads["low"]
         arrival_ns = np.full(len(positions), NO_STAMP, np.int64)
-        for present in np.unique(number):
-            rows = np.flatnonzero((number == present) & ~simple)
-            arrival_ns[rows] = _arrival_ns(ticks[rows], interfaces[present])
+        for present in np.unique(number).tolist():
+            rows = number == present
+            linktype[rows & ~unknown] = interfaces[present].linktype
+            stamped = rows & ~simple
+            arrival_ns[stamped] = _arrival_ns(ticks[stamped], interfaces[present])
         room = heads["length"].astype(np.int64) - np.where(simple, 16, 32)
         wire_length = heads["wire_length"].astype(np.int64)
         captured = heads["captured"].astype(np.int64)

@@ -1,7 +1,7 @@
-"""The short way for most of what is captured: whole Ethernet/IPv4 packets with UDP or TCP, by columns.
+"""The short way for most of what is captured: whole IPv4 packets with UDP or TCP, by columns.
 
-Plain is a packet without VLAN tag, IP option or fragment whose lengths agree with each other. All others take the
-general way (``link``, ``ip``).
+Plain is a packet over Ethernet with one VLAN tag at most, Linux cooked or raw IP, without IP option or fragment, whose
+lengths agree with each other. All others take the general way (``link``, ``ip``), which plain ones could take too.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ import numpy.typing as npt
 from pmutools.formats.capture import ip, link
 from pmutools.formats.capture.records import Ints, Records, gather
 
-_ETHERNET = 14
-_HEADERS = _ETHERNET + 20
+Mask = npt.NDArray[np.bool_]
 
 _IPV4 = np.dtype(
     [
-        ("ethertype", ">u2"),
         ("version", "u1"),  # and header length
         ("tos", "u1"),
         ("total", ">u2"),
@@ -30,19 +28,21 @@ _IPV4 = np.dtype(
         ("checksum", ">u2"),
         ("key", "V12"),  # addresses and ports
         ("length", ">u2"),  # of UDP
+        ("udp_checksum", ">u2"),
     ]
 )
 _TCP = np.dtype(
     [("ports", ">u4"), ("sequence", ">u4"), ("acknowledged", ">u4"), ("offset", "u1"), ("flags", "u1"), ("rest", "V6")]
 )
+_ETHERTYPE = np.dtype(">u2")
 
 
 class Plain(NamedTuple):
     """Of N packets: which are plain UDP, which plain TCP; of these the flow's key, where the payload is, and (TCP) the
     sequence number, the one acknowledged, and the flags. All of shape (N,)."""
 
-    udp: npt.NDArray[np.bool_]
-    tcp: npt.NDArray[np.bool_]
+    udp: Mask
+    tcp: Mask
     key: npt.NDArray[Any]
     begin: Ints
     end: Ints
@@ -53,25 +53,46 @@ class Plain(NamedTuple):
 
 def plain(records: Records) -> Plain:
     """Find the plain packets and read their headers."""
-    size = records.stop - records.start
-    head = _heads(records, (records.linktype == link.ETHERNET) & (size >= _HEADERS + 8), _ETHERNET - 2, _IPV4)
+    at, carried = _network(records)
+    head = _heads(records, carried, at, _IPV4)
     total = head["total"].astype(np.int64)
-    whole = (head["ethertype"] == link.IPV4) & (head["version"] == 0x45) & (head["fragment"] & 0x3FFF == 0)
-    whole &= size >= total + _ETHERNET
+    whole = (head["version"] == 0x45) & (head["fragment"] & 0x3FFF == 0) & (at + total <= records.stop)
     length = head["length"].astype(np.int64)
     udp = whole & (head["protocol"] == ip.UDP) & (length >= 8) & (total == length + 20)
-    segment = _heads(records, whole & (head["protocol"] == ip.TCP) & (total >= 40), _HEADERS, _TCP)
+    segment = _heads(records, whole & (head["protocol"] == ip.TCP) & (total >= 40), at + 20, _TCP)
     header = segment["offset"].astype(np.int64) >> 4 << 2
     tcp = (header >= 20) & (total >= 20 + header)
-    begin = records.start + _HEADERS + np.where(tcp, header, 8)
-    end = records.start + _ETHERNET + total
-    return Plain(udp, tcp, head["key"], begin, end, segment["sequence"], segment["acknowledged"], segment["flags"])
+    begin = at + 20 + np.where(tcp, header, 8)
+    columns = segment["sequence"], segment["acknowledged"], segment["flags"]
+    return Plain(udp, tcp, head["key"], begin, at + total, *columns)
 
 
-def _heads(records: Records, present: npt.NDArray[np.bool_], offset: int, layout: np.dtype[Any]) -> npt.NDArray[Any]:
-    """The headers at ``offset`` of the packets that have one, zeros for the others."""
+def _network(records: Records) -> tuple[Ints, Mask]:
+    """Where each packet's network header is, and whether it is announced as IPv4 (raw IP: may be)."""
+    offset = np.zeros(len(records.start), np.int64)
+    announced = np.zeros(len(offset), np.bool_)
+    for linktype in np.unique(records.linktype).tolist():
+        rows = records.linktype == linktype
+        if linktype in link.RAW_IP:
+            announced |= rows
+        elif linktype in link.ETHERTYPE_AT:
+            place, after = link.ETHERTYPE_AT[linktype]
+            ethertype = _heads(records, rows, records.start + place, _ETHERTYPE)
+            tagged = ethertype == link.VLAN
+            offset[rows] = after
+            if tagged.any():
+                offset[tagged] += 4
+                tagged_type = _heads(records, tagged, records.start + offset - 2, _ETHERTYPE)
+                ethertype = np.where(tagged, tagged_type, ethertype)
+            announced |= ethertype == link.IPV4
+    return records.start + offset, announced
+
+
+def _heads(records: Records, wanted: Mask, at: Ints, layout: np.dtype[Any]) -> npt.NDArray[Any]:
+    """The structures at ``at`` of the wanted packets that hold them, zeros for the others."""
+    present = wanted & (at + layout.itemsize <= records.stop)
     if present.all():
-        return gather(records.data, records.start + offset, layout)
+        return gather(records.data, at, layout)
     heads = np.zeros(len(present), layout)
-    heads[present] = gather(records.data, records.start[present] + offset, layout)
+    heads[present] = gather(records.data, at[present], layout)
     return heads

@@ -52,7 +52,8 @@ class CaptureReader:
         self.tally = Tally()
         self._window: Window | None = None
         with Window(self.path) as window:
-            _require_capture(window)
+            self.kind = _require_capture(window)
+            """``pcap`` or ``pcapng``."""
 
     @property
     def progress(self) -> float:
@@ -65,8 +66,7 @@ class CaptureReader:
         tally = self.tally = Tally()
         with Window(self.path) as window:
             self._window = window
-            _require_capture(window)
-            read = read_pcapng if is_pcapng(window.data) else read_pcap
+            read = read_pcapng if _require_capture(window) == "pcapng" else read_pcap
             dissector = _Dissector(tally)
             for batch in read(window, tally):
                 chunks = dissector.chunks(batch)
@@ -81,10 +81,10 @@ def is_capture(head: bytes) -> bool:
     return head[:4] in MAGICS or is_pcapng(head)
 
 
-def _require_capture(window: Window) -> None:
+def _require_capture(window: Window) -> str:
     window.advance(0, 12)
     if is_capture(window.data):
-        return
+        return "pcapng" if is_pcapng(window.data) else "pcap"
     if not window.data:
         why = "holds nothing that can be decompressed" if window.size else "is empty"
         raise SourceError(f"{window.path} {why}; record it again or name another file")

@@ -23,6 +23,9 @@ MAX_PACKET = 1 << 20
 LOOK = 4 * MAX_PACKET
 """Bytes that a judgement or the proof of a search result may look at."""
 
+RUN = 4096
+"""Records taken at a time: enough to make light of numpy's overhead, few enough to retrace after damage."""
+
 NO_STAMP = -(1 << 63)
 """In :attr:`Records.arrival_ns`: the file has no stamp for this packet."""
 
@@ -42,7 +45,7 @@ class Records(NamedTuple):
 
 class Verdict(NamedTuple):
     """On the record where a run stopped: it is good up to ``kept`` (where it starts, if it is none of ours), and
-    reading goes on at ``resume``. ``cut``: the bytes between are the file's cut tail. ``need``: look again with as
+    reading goes on at ``resume``. ``cut``: the bytes between are the file's cut tail. ``need``: ask again with as
     many bytes in view. ``record``: the packet, if there is one up to ``kept``."""
 
     kept: int
@@ -55,30 +58,41 @@ class Verdict(NamedTuple):
 class Grammar(Protocol):
     """One file's record structure."""
 
-    def run(self, data: bytes) -> tuple[Records, int]:
-        """The packets of the sound records from the start of ``data``, and where the first other record starts."""
+    def run(self, data: bytes, pos: int) -> tuple[Records, int]:
+        """The packets of sound records from ``pos`` on, :data:`RUN` at most, and where the next record starts."""
 
     def judge(self, data: bytes, pos: int, ended: bool) -> Verdict:
-        """Decide on the record at ``pos``, with :data:`LOOK` bytes in view or the end of the file."""
+        """Decide on the record at ``pos``, with more than :data:`LOOK` bytes in view or the end of the file."""
 
 
 def read_records(window: Window, tally: Tally, grammar: Grammar) -> Iterator[Records]:
-    """The packets of the rest of a file, those of about a block of the file at a time."""
-    drop, need = 0, BLOCK
+    """The packets of the rest of a file, at most :data:`RUN` at a time."""
+    pos = 0
     in_gap = False
     while True:
-        window.advance(drop, need)
         data = window.data
-        records, pos = grammar.run(data)
-        yield records
-        verdict = Verdict(pos, pos, need=BLOCK if pos else _VIEW)
-        if window.ended or len(data) - pos >= LOOK:
-            verdict = grammar.judge(data, pos, window.ended)
-            if verdict.record is not None:
-                yield verdict.record
-        captured = [part.stop - part.start for part in (records, verdict.record) if part is not None]
-        tally.overhead_bytes += verdict.kept - sum(int(each.sum()) for each in captured)
-        in_gap = in_gap and not verdict.kept
+        records, stop = grammar.run(data, pos)
+        if stop > pos:
+            tally.overhead_bytes += stop - pos - _captured(records)
+            pos, in_gap = stop, False
+            yield records
+            continue
+        left = len(data) - pos
+        if left < _VIEW and not window.ended:
+            window.advance(pos, BLOCK if left < BLOCK else _VIEW)
+            pos = 0
+            continue
+        if not left:
+            return
+        verdict = grammar.judge(data, pos, window.ended)
+        if verdict.need:
+            window.advance(pos, verdict.need)
+            pos = 0
+            continue
+        if verdict.record is not None:
+            tally.overhead_bytes += verdict.kept - pos - _captured(verdict.record)
+            in_gap = False
+            yield verdict.record
         passed = verdict.resume - verdict.kept
         if verdict.cut:
             tally.cut_bytes += passed
@@ -86,9 +100,11 @@ def read_records(window: Window, tally: Tally, grammar: Grammar) -> Iterator[Rec
             tally.skipped_bytes += passed
             tally.gaps += not in_gap
             in_gap = True
-        drop, need = verdict.resume, max(verdict.need, BLOCK)
-        if window.ended and drop == len(data):
-            return
+        pos = verdict.resume
+
+
+def _captured(records: Records) -> int:
+    return int((records.stop - records.start).sum())
 
 
 def gather(data: bytes, positions: Ints, layout: np.dtype[Any]) -> npt.NDArray[Any]:
