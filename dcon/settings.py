@@ -9,15 +9,36 @@ from typing import Any
 
 from dcon.core.params import Pair, Params, PmuParams, Thresholds
 from pmutools.errors import SettingsError, SourceError
-from pmutools.net.endpoint import Endpoint, parse_endpoint
+from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
 from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
 
 SIDES = ("north", "south", "none")
+PARAMS = {item.name: item for item in fields(Params)}
+FROM_SITES = frozenset(("pmus", "instances", "thresholds", "rate_hz"))
+"""Fields of Params that follow from the PMUs' sections: no keys of ``[controller]``."""
+_RATE = PARAMS["rate_hz"].metadata
 
 
 def _endpoint(text: str) -> Endpoint:
-    return parse_endpoint(text)
+    try:
+        return parse_endpoint(text)
+    except SettingsError as error:
+        raise ValueError(error) from None  # the reader adds where
+
+
+def _destination(text: str) -> Endpoint:
+    endpoint = _endpoint(text)
+    if endpoint.scheme is not Scheme.UDP or not endpoint.port:
+        raise ValueError(f"{text}: commands leave as udp://HOST:PORT")
+    return endpoint
+
+
+def _voltage(text: str) -> tuple[str, ...]:
+    channels = words(text)
+    if len(set(channels)) != len(channels) or len(channels) not in (1, 3):
+        raise ValueError(f"{text!r} is neither one positive-sequence channel nor three phases VA,VB,VC")
+    return channels
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,19 +54,24 @@ class Site:
     """Station of a stream with several."""
     side: str = field(default="none", metadata=parsed_by(choice(*SIDES)))
     """``north``, ``south``, or ``none`` for a PMU that is recorded only."""
-    voltage: tuple[str, ...] = field(default=("VA", "VB", "VC"), metadata=parsed_by(words))
+    voltage: tuple[str, ...] = field(default=("VA", "VB", "VC"), metadata=parsed_by(_voltage))
     """Positive-sequence channel, or those of the three phases."""
     nominal_kv: float | None = field(default=None, metadata=parsed_by(number(0.1, 2000)))
     """Line-to-line; without it the voltage's magnitude is not judged."""
-    rate: int = field(default=60, metadata=parsed_by(integer(1, 240)))
-    """Frames per second."""
+    rate: int = field(default=60, metadata=parsed_by(integer(_RATE["low"], _RATE["high"])))
+    """Frames per second; the same for all."""
+
+    @property
+    def stream(self) -> int | None:
+        """IDCODE of the stream, from either key."""
+        return self.url.idcode if self.idcode is None else self.idcode
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
     """``[output]``: where the command goes."""
 
-    url: Endpoint | None = field(default=None, metadata=parsed_by(_endpoint))
+    url: Endpoint | None = field(default=None, metadata=parsed_by(_destination))
     """``udp://HOST:PORT`` of the plant or gateway; nothing is sent without it."""
 
 
@@ -64,6 +90,11 @@ class Log:
     """``[log]``."""
 
     path: str = field(default="session.mcap", metadata=parsed_by(str))
+
+
+@dataclass(frozen=True, slots=True)
+class Reserved:
+    """``[watchdog] [server] [pdci]``: known sections that have no key yet."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +130,15 @@ def parse(text: str, source: str, changes: tuple[str, ...] = ()) -> Settings:
 
 def from_ini(ini: Ini, text: str = "") -> Settings:
     ini.only("pmu *", "controller", "supervisor", "platform", "watchdog", "server", "output", "pdci", "log")
-    sites = tuple(fill(Site, section, name=section.argument) for section in ini.family("pmu"))
-    if not sites:
+    for name in ("watchdog", "server", "pdci"):
+        fill(Reserved, ini.section(name))
+    sections = ini.family("pmu")
+    if not sections:
         raise SettingsError(f"{ini.source}: no [pmu NAME] section; add one for each PMU")
+    sites = tuple(fill(Site, section, name=section.argument) for section in sections)
+    _check_apart(sections, sites)
     return Settings(
-        _params(ini, sites),
+        _params(ini, sections, sites),
         sites,
         fill(Output, ini.section("output")),
         fill(Platform, ini.section("platform")),
@@ -112,26 +147,52 @@ def from_ini(ini: Ini, text: str = "") -> Settings:
     )
 
 
-def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
+def _check_apart(sections: tuple[Section, ...], sites: tuple[Site, ...]) -> None:
+    """Raise SettingsError for a PMU that would be given the frames of another, or that has two IDCODEs."""
+    for index, (section, site) in enumerate(zip(sections, sites, strict=True)):
+        if site.idcode is not None and site.url.idcode not in (None, site.idcode):
+            raise section.entries["idcode"].where.error(f"{site.idcode}, but the url says {site.url.idcode}; keep one")
+        for other in sites[:index]:
+            if _overlap(site, other):
+                problem = f"{site.url} gives it the frames of {other.name} too"
+                raise section.where.error(f"{problem}; tell the two apart by idcode, station or ?source=")
+
+
+def _overlap(site: Site, other: Site) -> bool:
+    one, two = site.url, other.url
+    if (one.scheme, one.host, one.port) != (two.scheme, two.host, two.port):
+        return False
+    pairs = ((site.stream, other.stream), (site.station, other.station), (one.source, two.source))
+    return all(None in pair or pair[0] == pair[1] for pair in pairs)
+
+
+def _params(ini: Ini, sections: tuple[Section, ...], sites: tuple[Site, ...]) -> Params:
+    for section, site in zip(sections, sites, strict=True):
+        if site.rate != sites[0].rate:
+            entry = section.entries.get("rate") or section.entries["url"]
+            raise entry.where.error(
+                f"{site.rate} frames/s, but {sites[0].name} has {sites[0].rate}; the controller needs one rate"
+            )
     section = ini.section("controller")
     entries = dict(section.entries)
     priority = entries.pop("priority", None)
-    numbers = _numbers(Params, Section(section.name, section.where, entries), skip={"pmus", "instances", "thresholds"})
+    given = _numbers(Params, Section(section.name, section.where, entries), skip=FROM_SITES)
     thresholds = Thresholds(**_numbers(Thresholds, ini.section("supervisor")))
-    rates = {site.rate for site in sites}
-    if len(rates) > 1 and "rate_hz" not in numbers:
-        listed = ", ".join(f"{site.name} {site.rate}" for site in sites)
-        raise SettingsError(f"{ini.source}: PMUs at different rates ({listed}); the controller needs one rate")
-    numbers.setdefault("rate_hz", rates.pop())
+    instances = _every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
+    gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
+    if gain > most:
+        entry = entries.get("gain_mw_per_mhz") or entries["gain_max_mw_per_mhz"]
+        raise entry.where.error(f"{gain:g} MW/mHz is above gain_max_mw_per_mhz = {most:g}; 9 to 15 are usable")
     try:
         return Params(
             pmus=tuple(PmuParams(site.name, site.nominal_kv) for site in sites),
-            instances=_instances(sites, priority),
+            instances=instances,
             thresholds=thresholds,
-            **numbers,
+            rate_hz=sites[0].rate,
+            **given,
         )
     except SettingsError as error:
-        raise SettingsError(f"{section.where}: {error}") from None
+        raise section.where.error(error) from None
 
 
 def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[str, Any]:
@@ -153,34 +214,56 @@ def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[st
     return values
 
 
-def _instances(sites: tuple[Site, ...], priority: Entry | None) -> tuple[Pair, ...]:
-    """Control instances, best first: as ``priority`` says, else every north PMU with every south one."""
+def _every_pair(source: str, sites: tuple[Site, ...]) -> tuple[Pair, ...]:
+    """Every north PMU with every south one, in the order of the file."""
+    sides = {side: [index for index, site in enumerate(sites) if site.side == side] for side in ("north", "south")}
+    for side, members in sides.items():
+        if not members:
+            raise SettingsError(f"{source}: no PMU has side = {side}; add that line to at least one [pmu NAME]")
+    return tuple(Pair(north, south) for north in sides["north"] for south in sides["south"])
+
+
+def _priority(sites: tuple[Site, ...], priority: Entry) -> tuple[Pair, ...]:
+    """Control instances as ``priority`` lists them, best first."""
     index = {site.name: number for number, site in enumerate(sites)}
-    if priority is None:
-        north = [index[site.name] for site in sites if site.side == "north"]
-        south = [index[site.name] for site in sites if site.side == "south"]
-        return tuple(Pair(n, s) for n in north for s in south)
-    pairs = []
-    for name in words(priority.text):
+    pairs: list[Pair] = []
+    for name in priority.read(words):
         split = [(n, name[len(n) + 1 :]) for n in index if name.startswith(f"{n}-") and name[len(n) + 1 :] in index]
-        if not split:
+        if len(split) != 1:
             raise priority.where.error(f"{name!r} is no pair NORTH-SOUTH of PMUs; there are {', '.join(index)}")
-        north_name, south_name = split[0]
-        if sites[index[north_name]].side != "north" or sites[index[south_name]].side != "south":
-            raise priority.where.error(f"{name!r}: {north_name} must have side = north and {south_name} side = south")
-        pairs.append(Pair(index[north_name], index[south_name]))
+        ((north, south),) = split
+        if sites[index[north]].side != "north" or sites[index[south]].side != "south":
+            raise priority.where.error(f"{name!r}: {north} must have side = north and {south} side = south")
+        pair = Pair(index[north], index[south])
+        if pair in pairs:
+            raise priority.where.error(f"{name!r} is listed twice; keep the first")
+        pairs.append(pair)
+    if not pairs:
+        raise priority.where.error("lists no pair; write NORTH-SOUTH,NORTH-SOUTH,... or leave the key out")
     return tuple(pairs)
 
 
 def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
-    """Every number in force, for ``dcon check``: section, key, value with unit, source."""
+    """Every setting in force but those of single PMUs, for ``dcon check``: section, key, value with unit, source."""
     rows = []
-    for section, values in (("controller", settings.params), ("supervisor", settings.params.thresholds)):
+    params = settings.params
+    sections: tuple[tuple[str, Any], ...] = (
+        ("controller", params),
+        ("supervisor", params.thresholds),
+        ("platform", settings.platform),
+        ("output", settings.output),
+        ("log", settings.log),
+    )
+    for section, values in sections:
         for item in fields(values):
-            if item.name in ("pmus", "instances", "thresholds"):
-                continue
-            value, unit = getattr(values, item.name), item.metadata.get("unit", "")
-            shown = f"{value:g}" if isinstance(value, float) else str(value).lower()
-            rows.append((section, item.name, f"{shown} {unit}".strip(), item.metadata.get("source", "")))
-    rows.append(("controller", "priority", ",".join(settings.params.instance_names), ""))
+            if item.name not in FROM_SITES:
+                value = _shown(getattr(values, item.name), item.metadata.get("unit", ""))
+                rows.append((section, item.name, value, item.metadata.get("source", "")))
+        if section == "controller":
+            rows.append((section, "priority", ",".join(params.instance_names), ""))
     return rows
+
+
+def _shown(value: object, unit: str) -> str:
+    text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
+    return f"{text.lower() if isinstance(value, bool) else text} {unit}".strip()

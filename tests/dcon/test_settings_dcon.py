@@ -1,0 +1,281 @@
+"""The initialisation file: what it says is in force, and every mistake in it is one line that says where."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dcon.cli import dcon
+from dcon.core.params import Pair, Params, Thresholds
+from dcon.settings import effective, load, parse
+from pmutools.cli.shell import run
+from pmutools.errors import SettingsError, SourceError
+
+GOOD = """\
+[DEFAULT]
+rate = 60
+voltage = VA,VB,VC
+nominal_kv = 500
+[pmu N1]
+url = udp://0.0.0.0:4801?source=192.0.2.11
+idcode = 101
+side = north
+[pmu N2]
+url = udp://0.0.0.0:4802
+side = north
+voltage = V1LPM
+[pmu S1]
+url = tcp://192.0.2.21:4712
+idcode = 201
+station = SOUTH ONE
+side = south
+[pmu S2]
+url = tcp://192.0.2.21:4712?idcode=201
+station = SOUTH TWO
+side = south
+[pmu X]
+url = udp://0.0.0.0:4803
+nominal_kv = 230 ; recorded only
+[controller]
+gain_mw_per_mhz = 12
+align = true
+[supervisor]
+gap_ms = 60
+[platform]
+phase_ms = 4.5
+[watchdog]
+[server]
+[output]
+url = udp://192.0.2.30:4790
+[pdci]
+[log]
+path = /var/log/dcon.mcap
+"""
+
+
+def test_what_the_file_says_is_in_force() -> None:
+    settings = parse(GOOD, "dcon.ini")
+    params = settings.params
+    assert (params.gain_mw_per_mhz, params.deadband_mhz, params.rate_hz, params.align) == (12.0, 0.25, 60, True)
+    assert params.instance_names == ("N1-S1", "N1-S2", "N2-S1", "N2-S2")
+    assert params.thresholds.gap_ms == 60
+    assert [pmu.nominal_kv for pmu in params.pmus] == [500, 500, 500, 500, 230]
+    assert [site.voltage for site in settings.sites][:2] == [("VA", "VB", "VC"), ("V1LPM",)]
+    assert [site.stream for site in settings.sites] == [101, None, 201, 201, None]
+    assert settings.sites[0].url.source == "192.0.2.11"
+    assert (settings.platform.phase_ms, settings.platform.fifo) == (4.5, True)
+    assert str(settings.output.url) == "udp://192.0.2.30:4790"
+    assert settings.log.path == "/var/log/dcon.mcap"
+    assert settings.text == GOOD
+
+
+def test_defaults_are_those_of_the_controller() -> None:
+    text = "[pmu A]\nurl = udp://h:1\nside = north\n[pmu B]\nurl = udp://h:2\nside = south\n"
+    settings = parse(text, "dcon.ini")
+    assert settings.params.thresholds == Thresholds()
+    assert settings.params == Params(pmus=settings.params.pmus, instances=(Pair(0, 1),))
+    assert settings.output.url is None
+
+
+def test_a_priority_orders_the_instances() -> None:
+    settings = parse(GOOD.replace("align = true", "priority = N2-S2, N1-S1"), "dcon.ini")
+    assert settings.params.instance_names == ("N2-S2", "N1-S1")
+    assert settings.params.instances == (Pair(1, 3), Pair(0, 2))
+
+
+def test_names_with_hyphens_pair_where_that_is_unambiguous() -> None:
+    text = GOOD.replace("[pmu N1]", "[pmu N-1]").replace("[pmu S1]", "[pmu S-1]")
+    settings = parse(text.replace("align = true", "priority = N-1-S-1"), "dcon.ini")
+    assert settings.params.instances == (Pair(0, 2),)
+
+
+def test_other_rates_than_60() -> None:
+    settings = parse(GOOD.replace("rate = 60", "rate = 30"), "dcon.ini")
+    assert settings.params.rate_hz == 30 and settings.params.coefficients.rate_hz == 30
+
+
+MISTAKES = {
+    "an unknown section": ("[log]", "[logg]", "dcon.ini:37: [logg]: unknown section; did you mean 'log'?"),
+    "an unknown key of the controller": (
+        "align = true",
+        "gain = 12",
+        "dcon.ini:27: [controller] gain: unknown key; ",
+    ),
+    "an unknown key of a PMU": ("side = south", "sid = south", "dcon.ini:17: [pmu S1] sid: unknown key; did you mean"),
+    "an unknown check": ("gap_ms", "gap_s", "dcon.ini:29: [supervisor] gap_s: unknown key; did you mean 'gap_ms'?"),
+    "a key of a section that has none yet": (
+        "[watchdog]",
+        "[watchdog]\ntimeout_ms = 100",
+        "dcon.ini:33: [watchdog] timeout_ms: unknown key",
+    ),
+    "a unit in a value": ("gap_ms = 60", "gap_ms = 60 ms", "dcon.ini:29: [supervisor] gap_ms: '60 ms' is not a number"),
+    "not a number": ("= 4.5", "= nan", "dcon.ini:31: [platform] phase_ms: 'nan' is not a finite number"),
+    "neither yes nor no": ("= true", "= maybe", "dcon.ini:27: [controller] align: 'maybe' is neither yes nor no"),
+    "a threshold out of range": (
+        "gap_ms = 60",
+        "voltage_max_pu = 3",
+        "dcon.ini:29: [supervisor] voltage_max_pu: 3 is out of range; it must be 0 to 2",
+    ),
+    "a gain out of range": (
+        "gain_mw_per_mhz = 12",
+        "gain_mw_per_mhz = 16",
+        "dcon.ini:26: [controller] gain_mw_per_mhz: 16 MW/mHz is above gain_max_mw_per_mhz = 15; 9 to 15 are usable",
+    ),
+    "a largest gain below the default": (
+        "gain_mw_per_mhz = 12",
+        "gain_max_mw_per_mhz = 5",
+        "dcon.ini:26: [controller] gain_max_mw_per_mhz: 9 MW/mHz is above gain_max_mw_per_mhz = 5",
+    ),
+    "a negative gain": ("= 12", "= -1", "dcon.ini:26: [controller] gain_mw_per_mhz: -1 is out of range; "),
+    "a limit above the line's": ("align = true", "limit_mw = 200", "dcon.ini:27: [controller] limit_mw: 200 is out"),
+    "a section given twice": ("[pmu N2]", "[pmu N1]", "dcon.ini:9: [pmu N1]: section given twice, first on line 5"),
+    "a key given twice": ("side = north\n[pmu N2]", "url = udp://h:1\n[pmu N2]", "dcon.ini:8: [pmu N1] url: key given"),
+    "no url": (
+        "url = udp://0.0.0.0:4802\n",
+        "",
+        "dcon.ini:9: [pmu N2]: url is missing; add a line 'url = ...'",
+    ),
+    "a url without a scheme": (
+        "udp://0.0.0.0:4802",
+        "0.0.0.0:4802",
+        "dcon.ini:10: [pmu N2] url: 0.0.0.0:4802: no endpoint URL; write tcp://0.0.0.0:4802",
+    ),
+    "a url without a port": ("udp://0.0.0.0:4802", "udp://h", "dcon.ini:10: [pmu N2] url: udp://h: no port; "),
+    "an output that is no datagram": (
+        "udp://192.0.2.30:4790",
+        "tcp://192.0.2.30:4790",
+        "dcon.ini:35: [output] url: tcp://192.0.2.30:4790: commands leave as udp://HOST:PORT",
+    ),
+    "an IDCODE that cannot be": ("idcode = 101", "idcode = 70000", "dcon.ini:7: [pmu N1] idcode: 70000 is out of"),
+    "two IDCODEs": (
+        "station = SOUTH TWO",
+        "idcode = 202\nstation = SOUTH TWO",
+        "dcon.ini:20: [pmu S2] idcode: 202, but the url says 201; keep one",
+    ),
+    "two PMUs of one stream": (
+        "station = SOUTH TWO",
+        "station = SOUTH ONE",
+        "dcon.ini:18: [pmu S2]: tcp://192.0.2.21:4712?idcode=201 gives it the frames of S1 too; tell the two apart by",
+    ),
+    "two PMUs that share a port": (
+        "udp://0.0.0.0:4802",
+        "udp://0.0.0.0:4801",
+        "dcon.ini:9: [pmu N2]: udp://0.0.0.0:4801 gives it the frames of N1 too; tell the two apart by idcode, ",
+    ),
+    "a side that is none": ("side = south", "side = west", "dcon.ini:17: [pmu S1] side: 'west' is not one of north, "),
+    "two channels for V1": (
+        "voltage = V1LPM",
+        "voltage = VA,VB",
+        "dcon.ini:12: [pmu N2] voltage: 'VA,VB' is neither one positive-sequence channel nor three phases VA,VB,VC",
+    ),
+    "different rates": (
+        "side = south",
+        "side = south\nrate = 30",
+        "dcon.ini:18: [pmu S1] rate: 30 frames/s, but N1 has 60; the controller needs one rate",
+    ),
+    "a rate that the filter cannot have": (
+        "rate = 60",
+        "rate = 5",
+        "dcon.ini:2: [DEFAULT] rate: 5 is out of range; it must be 6 to 240",
+    ),
+    "a pair of unknown PMUs": (
+        "align = true",
+        "priority = N1-S1,N1-S9",
+        "dcon.ini:27: [controller] priority: 'N1-S9' is no pair NORTH-SOUTH of PMUs; there are N1, N2, S1, S2, X",
+    ),
+    "a pair the wrong way round": (
+        "align = true",
+        "priority = S1-N1",
+        "dcon.ini:27: [controller] priority: 'S1-N1': S1 must have side = north and N1 side = south",
+    ),
+    "a pair with a PMU of no side": (
+        "align = true",
+        "priority = N1-X",
+        "dcon.ini:27: [controller] priority: 'N1-X': N1 must have side = north and X side = south",
+    ),
+    "a pair listed twice": (
+        "align = true",
+        "priority = N1-S1,N2-S1,N1-S1",
+        "dcon.ini:27: [controller] priority: 'N1-S1' is listed twice; keep the first",
+    ),
+    "an empty priority": ("align = true", "priority =", "dcon.ini:27: [controller] priority: lists no pair; "),
+    "an empty item": ("align = true", "priority = N1-S1,,N2-S1", "dcon.ini:27: [controller] priority: 'N1-S1,,N2-S1' "),
+    "no north": ("side = north", "side = none", "dcon.ini: no PMU has side = north; add that line to at least one"),
+    "a line that is nothing": ("align = true", "align", "dcon.ini:27: 'align' is neither [section] nor key = value"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_one_line_that_says_where_and_what_to_do(
+    old: str,
+    new: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert old in GOOD
+    text = GOOD.replace(old, new, -1 if new == "side = none" else 1)
+    monkeypatch.chdir(tmp_path)
+    Path("dcon.ini").write_text(text)
+    assert run(dcon(), ["check", "--ini", "dcon.ini"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"dcon: {message}")
+    assert err.count("\n") == 1
+
+
+def test_a_file_without_pmus() -> None:
+    with pytest.raises(SettingsError, match=r"^dcon.ini: no \[pmu NAME\] section; add one for each PMU$"):
+        parse("[controller]\ngain_mw_per_mhz = 9\n", "dcon.ini")
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00[", "folder"])
+def test_a_file_that_cannot_be_read_fails_in_one_line(
+    content: bytes | str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "dcon.ini"
+    if content == "folder":
+        path.mkdir()
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    for command in ("check", "platform"):
+        assert run(dcon(), [command, "--ini", str(path)]) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"dcon: {path}: ") and err.count("\n") == 1
+    with pytest.raises(SourceError):
+        load(path)
+
+
+def test_changes_lie_over_the_file_and_know_where_they_come_from() -> None:
+    settings = parse(GOOD, "dcon.ini", ("controller.gain_mw_per_mhz=9", "pmu N1.nominal_kv=345", "platform.fifo=no"))
+    assert settings.params.gain_mw_per_mhz == 9.0
+    assert settings.params.pmus[0].nominal_kv == 345
+    assert not settings.platform.fifo
+    for change, message in {
+        "controller.gain_mw_per_mhz": "is not SECTION.KEY=VALUE",
+        "controller.gain_mw_per_mhz=99": r"--set: \[controller\] gain_mw_per_mhz: 99 MW/mHz is above",
+        "nowhere.gain=9": r"\[nowhere\]: unknown section",
+    }.items():
+        with pytest.raises(SettingsError, match=message):
+            parse(GOOD, "dcon.ini", (change,))
+
+
+def test_check_prints_every_setting_with_unit_and_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "dcon.ini"
+    path.write_text(GOOD)
+    assert run(dcon(), ["check", "--ini", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "[controller] gain_mw_per_mhz = 12 MW/mHz   (section VI" in text
+    assert "[supervisor] gap_ms = 60 ms   (section IV b)" in text
+    assert "[output] url = udp://192.0.2.30:4790" in text
+    assert "[pmu S1]  url = tcp://192.0.2.21:4712  idcode = 201  station = SOUTH ONE  side = south" in text
+    assert run(dcon(), ["check", "--ini", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [pmu["name"] for pmu in found["pmus"]] == ["N1", "N2", "S1", "S2", "X"]
+    shown = {(row["section"], row["key"]): row["value"] for row in found["settings"]}
+    assert shown["controller", "priority"] == "N1-S1,N1-S2,N2-S1,N2-S2"
+    assert {section for section, _ in shown} == {"controller", "supervisor", "platform", "output", "log"}
+    assert len(shown) == len(found["settings"]) == len(effective(load(path)))
