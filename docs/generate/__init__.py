@@ -1,0 +1,17 @@
+"""Tables of the documentation that exist as tables in code: one function each, called when the site is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from generate import commands, controller, impairments, streams, structure, studies
+
+GENERATORS: dict[str, Callable[[], str]] = {
+    **structure.GENERATORS,
+    **streams.GENERATORS,
+    **impairments.GENERATORS,
+    **controller.GENERATORS,
+    **studies.GENERATORS,
+    **commands.GENERATORS,
+}
+"""Markdown by the name that a marker gives."""
