@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.clock import VirtualClock
@@ -16,6 +16,7 @@ times = st.integers(0, 10**15)
 rates = st.fractions(min_value=Fraction(1, 100), max_value=100, max_denominator=1000)
 
 
+@settings(deadline=None)
 @given(times, times, rates, st.integers(0, 10**13))
 def test_media_time_and_target_are_inverse(anchor_ns: int, media_ns: int, rate: Fraction, ahead_ns: int) -> None:
     play = Playback(anchor_ns, media_ns, rate)
@@ -24,6 +25,7 @@ def test_media_time_and_target_are_inverse(anchor_ns: int, media_ns: int, rate: 
     assert 0 <= ahead_ns - (play.media_at(target_ns) - media_ns) <= rate + 1  # rounding down, once each way
 
 
+@settings(deadline=None)
 @given(rates, st.lists(st.integers(1, 10**9), min_size=1, max_size=50))
 def test_deadlines_do_not_accumulate_error(rate: Fraction, gaps_ns: list[int]) -> None:
     play = Playback(1000, 0, rate)
@@ -33,6 +35,7 @@ def test_deadlines_do_not_accumulate_error(rate: Fraction, gaps_ns: list[int]) -
         assert play.target_ns(media_ns) == 1000 + int(media_ns / rate)
 
 
+@settings(deadline=None)
 @given(times, rates, st.integers(0, 10**12), st.integers(0, 10**12), st.integers(0, 10**12))
 def test_pause_takes_no_media_time(start_ns: int, rate: Fraction, a: int, b: int, c: int) -> None:
     play = Playback(start_ns, 0, rate)
@@ -45,6 +48,7 @@ def test_pause_takes_no_media_time(start_ns: int, rate: Fraction, a: int, b: int
     assert -1 <= drift <= 0
 
 
+@settings(deadline=None)
 @given(times, rates, rates, st.integers(0, 10**12))
 def test_a_change_of_rate_leaves_no_jump(start_ns: int, rate: Fraction, other: Fraction, after_ns: int) -> None:
     play = Playback(start_ns, 0, rate)
@@ -86,6 +90,7 @@ def _filled(values: list[int], miss_ns: int = 1000) -> Lateness:
     return lateness
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(-(10**6), 10**11), min_size=1, max_size=200), st.floats(0, 100))
 def test_percentiles_bound_the_exact_ones(values: list[int], percent: float) -> None:
     lateness = _filled(values)
@@ -98,6 +103,7 @@ def test_percentiles_bound_the_exact_ones(values: list[int], percent: float) -> 
     assert lateness.misses == sum(value > 1000 for value in values)
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(0, 10**10)), st.lists(st.integers(0, 10**10)))
 def test_merged_is_the_same_as_counted_together(one: list[int], other: list[int]) -> None:
     merged = _filled(one)

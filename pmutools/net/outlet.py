@@ -126,6 +126,11 @@ class Outlet:
         self.handles = handles
         self.stage = stage
 
+    @property
+    def queued_bytes(self) -> int:
+        """What waits for clients to take it; nothing ever does over UDP."""
+        return 0
+
     def _obey(self, client: _Client, frame: bytes) -> bytes | None:
         """Do what a frame from a client asks for; returns the answer to send."""
         answer = client.role.hear(frame, self.stage.reactor.clock.realtime_ns())
@@ -234,6 +239,10 @@ class TcpOutlet(Outlet):
         """Send all clients away, with FIN or RST."""
         for client in list(self._clients):
             self._drop(client, ServerKind.DISCONNECTED, "by this side", reset=reset)
+
+    @property
+    def queued_bytes(self) -> int:
+        return sum(client.peer.queued_bytes for client in self._clients)
 
     def watch(self, client: _TcpClient, events: int) -> None:
         self.stage.reactor.watch(client.peer, events, lambda ready: self._ready(client, ready))

@@ -81,7 +81,8 @@ class Senders:
         self._share = 0
         if cfg_period_ns is not None:
             self._share_ns = max(cfg_period_ns // _SHARES, 1)
-            self._reactor.call_in(self._share_ns, self._announce_share)
+            self._share_due_ns = clock.monotonic_ns()
+            self._await_share()
         self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
 
     def __enter__(self) -> Senders:
@@ -163,6 +164,11 @@ class Senders:
     def audience(self, stream: int) -> int:
         """How many destinations a frame of this stream would go to now."""
         return len(self._audience.sinks[stream])
+
+    @property
+    def queued_bytes(self) -> int:
+        """What waits for TCP clients that are slow to take it."""
+        return sum(outlet.queued_bytes for _, outlet in self._outlets if outlet is not None)
 
     # --- running
 
@@ -250,10 +256,16 @@ class Senders:
             box = self._boxes[way] = Outbox(sock, self._dirty)
         return box
 
+    def _await_share(self) -> None:
+        """The next portion is due a fixed time after the one before was; after a long stall, from now."""
+        behind = self._clock.monotonic_ns() - self._share_due_ns > _SHARES * self._share_ns
+        self._share_due_ns = (self._clock.monotonic_ns() if behind else self._share_due_ns) + self._share_ns
+        self._reactor.call_at(self._share_due_ns, self._announce_share)
+
     def _announce_share(self) -> None:
         self.announce(range(self._share, len(self._served), _SHARES))
         self._share = (self._share + 1) % _SHARES
-        self._reactor.call_in(self._share_ns, self._announce_share)
+        self._await_share()
 
     def _keep_house(self) -> None:
         now_ns = self._clock.monotonic_ns()

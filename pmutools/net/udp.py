@@ -12,6 +12,7 @@ import struct
 import sys
 import time
 from collections.abc import Sequence
+from types import TracebackType
 from typing import NamedTuple
 
 from pmutools import linux
@@ -108,6 +109,14 @@ class UdpSocket:
             raise explain(error, f"udp://{wanted}") from None
         self.address = Address(wanted.family, sock.getsockname())
         self._flows: dict[bytes | tuple[str, int], Flow] = {}
+
+    def __enter__(self) -> UdpSocket:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def fileno(self) -> int:
         return self._sock.fileno()

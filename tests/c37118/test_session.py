@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.c37118 import (
@@ -201,6 +201,7 @@ moments = st.tuples(
 )
 
 
+@settings(deadline=None)
 @given(st.sampled_from(list(CLIENT_TABLES)), st.lists(moments, max_size=60))
 def test_whatever_comes_requests_stay_rare_and_deadlines_ahead(name: str, script: list[tuple[int, str]]) -> None:
     role = ClientRole(CLIENT_TABLES[name])
@@ -305,6 +306,7 @@ def test_what_a_server_does_not_serve_it_answers_by_silence(frame: bytes, outcom
         assert answer.extended == b"abcd"
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=40))
 def test_a_server_survives_any_bytes(junk: bytes) -> None:
     role = ServerRole({7: served(CONFIG)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.errors import SettingsError
@@ -36,6 +36,7 @@ def endpoints(draw: st.DrawFn) -> Endpoint:
     )
 
 
+@settings(deadline=None)
 @given(endpoints())
 def test_a_url_comes_back(endpoint: Endpoint) -> None:
     assert parse_endpoint(str(endpoint)) == endpoint
@@ -98,6 +99,7 @@ def test_mistakes_name_the_url_and_the_remedy(url: str, hint: str) -> None:
     assert "\n" not in message
 
 
+@settings(deadline=None)
 @given(st.text(max_size=40))
 def test_any_text_is_an_endpoint_or_a_mistake(text: str) -> None:
     for url in (text, f"udp://{text}", f"tcp://h:1?{text}"):
@@ -108,6 +110,7 @@ def test_any_text_is_an_endpoint_or_a_mistake(text: str) -> None:
         assert parse_endpoint(str(endpoint)) == endpoint
 
 
+@settings(deadline=None)
 @given(st.ip_addresses())
 def test_multicast_is_told_by_the_data_host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
     host = f"[{address}]" if address.version == 6 else str(address)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import socket
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.clock import VirtualClock
 from pmutools.net.reactor import READ, WRITE, Reactor
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 1000), st.booleans()), max_size=30))
 def test_timers_ring_in_order_unless_cancelled(timers: list[tuple[int, bool]]) -> None:
     clock = VirtualClock()

@@ -26,6 +26,7 @@ from pmutools.net.receiver import Receivers
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
 QUICK = Timing(answer_ns=120 * MS, silence_ns=150 * MS, silence_frames=1, tries=3)
+EAGER = Timing(answer_ns=300 * MS)
 paths = pytest.mark.parametrize("native", [linux.NATIVE, False], ids=["native", "portable"])
 
 
@@ -372,10 +373,10 @@ def test_a_closed_udp_port_is_told(native: bool) -> None:
 
 def test_frames_of_another_size_make_it_ask_again(device: Device) -> None:
     old, new = stream(7), stream(7, phasors=3, cfgcnt=1)
-    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", timing=QUICK) as ear:
+    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", timing=EAGER) as ear:
         play(device, ear, old)
         device.heard = b""
-        CLOCK.sleep_until(CLOCK.monotonic_ns() + QUICK.answer_ns)  # requests keep this distance
+        CLOCK.sleep_until(CLOCK.monotonic_ns() + EAGER.answer_ns)  # requests keep this distance
         device.say(data_frame(new, 10 * 10**9, value=10))
         ear.until(hears(device, Command.SEND_CFG2))
         device.say(encode_config(new))
@@ -386,10 +387,10 @@ def test_frames_of_another_size_make_it_ask_again(device: Device) -> None:
 
 def test_the_configuration_change_bit_makes_it_ask_again(device: Device) -> None:
     config = stream(7)
-    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", timing=QUICK) as ear:
+    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", timing=EAGER) as ear:
         play(device, ear, config)
         device.heard = b""
-        CLOCK.sleep_until(CLOCK.monotonic_ns() + QUICK.answer_ns)
+        CLOCK.sleep_until(CLOCK.monotonic_ns() + EAGER.answer_ns)
         device.say(data_frame(config, 10 * 10**9, stat=0x0400))
         ear.until(hears(device, Command.SEND_CFG2))
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from support.live import CLOCK, PATIENCE_NS, Ear, data_frame, free_udp_port, stream, values
@@ -26,6 +27,7 @@ from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
 from pmutools.net.outlet import ServerEvent, ServerKind
 from pmutools.net.receiver import Receivers
 from pmutools.net.server import Senders
+from pmutools.net.udp import UdpSocket
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
@@ -378,24 +380,37 @@ def test_clients_can_be_sent_away_and_come_back() -> None:
 
 
 @paths
-def test_spontaneous_streams_announce_themselves(native: bool) -> None:
+def test_spontaneous_streams_announce_themselves_and_go_out_in_one_tick(native: bool) -> None:
     port = free_udp_port()
-    with hearing(f"udp://127.0.0.1:{port}") as ear, Senders(CLOCK, cfg_period_ns=640 * MS, native=native) as senders:
+    with hearing(f"udp://127.0.0.1:{port}") as ear, Senders(CLOCK, native=native) as senders:
         handles = [senders.add(served(stream(idcode))) for idcode in range(1, 129)]
         senders.send_to(parse_endpoint(f"udp://127.0.0.1:{port}"), handles)
         senders.announce()
-        assert (
-            senders.publish([(handle, data_frame(stream(handle + 1), 10**9, value=handle)) for handle in handles]) == []
-        )
+        tick = [(handle, data_frame(stream(handle + 1), 10**9, value=handle)) for handle in handles]
+        assert senders.publish(tick) == []
         ear.until(lambda: values(ear.messages) == list(range(128)))
         assert len(ear.messages) == 256
-        end_ns = CLOCK.monotonic_ns() + 700 * MS
-        ear.until(lambda: CLOCK.monotonic_ns() > end_ns, senders)
-        again = ear.messages[256:]
-        assert {message.frame.idcode for message in again} == set(range(1, 129))  # everyone within a period, once,
-        assert len(again) < 160
-        stamps = [message.frame.arrival_ns or 0 for message in again]
-        assert max(stamps) - min(stamps) > 400 * MS  # and not in one burst
+
+
+def test_configurations_are_repeated_once_a_period_and_not_in_one_burst() -> None:
+    clock = VirtualClock()
+    with UdpSocket("127.0.0.1", 0) as ears, Senders(clock, cfg_period_ns=60 * 10**9) as senders:
+        handles = [senders.add(served(stream(idcode))) for idcode in range(1, 129)]
+        senders.send_to(parse_endpoint(f"udp://{ears.address}"), handles)
+        heard: dict[int, list[int]] = {}
+        bursts = []
+        while clock.monotonic_ns() <= 180 * 10**9:
+            senders.poll(100 * MS)
+            clock.advance(30 * MS)  # whoever polls is late now and then; the period must not grow by it
+            chunks = ears.read()
+            bursts.append(len(chunks))
+            for chunk in chunks:
+                heard.setdefault(decode_prefix(chunk.data).idcode, []).append(clock.monotonic_ns())
+        assert set(heard) == set(range(1, 129))
+        periods_ns = {later - earlier for times_ns in heard.values() for earlier, later in pairwise(times_ns)}
+        assert all(abs(period_ns - 60 * 10**9) <= 200 * MS for period_ns in periods_ns)
+        assert min(map(len, heard.values())) >= 2
+        assert max(bursts) <= 4
 
 
 @pytest.mark.skipif(not linux.NATIVE, reason="Linux multicast")
@@ -449,12 +464,15 @@ def test_frames_that_did_not_go_out_are_named() -> None:
 @paths
 def test_serving_until_a_deadline_is_exact_and_answers_meanwhile(native: bool) -> None:
     with serving("tcp://127.0.0.1:0", native=native) as server, clients(server, 1) as (client,):
-        deadline_ns = CLOCK.monotonic_ns() + 60 * MS
         client.say(encode_command(7, Command.SEND_CFG2))
-        while events := server.senders.serve_until(deadline_ns):
-            server.events += events
-        late_ns = CLOCK.monotonic_ns() - deadline_ns
-        assert 0 <= late_ns < 20 * MS
+        late_ns = []
+        for _ in range(20):
+            deadline_ns = CLOCK.monotonic_ns() + 6 * MS
+            while events := server.senders.serve_until(deadline_ns):
+                server.events += events
+            late_ns.append(CLOCK.monotonic_ns() - deadline_ns)
+        assert min(late_ns) >= 0
+        assert min(late_ns) < MS, late_ns  # however busy the machine, once in twenty it is on time
         assert Outcome.ANSWERED in server.kinds()
         assert len(client.hear()) == 1
         passed_ns = CLOCK.monotonic_ns()
