@@ -26,6 +26,7 @@ FRAGMENT_BYTES = 1 << 20
 FLOWS = 1 << 16
 """Flows remembered at once; the oldest is ended when another comes (a flood of spoofed sources)."""
 _FIRST_FRAGMENT, _LAST_FRAGMENT = 1, 0xFFFF
+_new = tuple.__new__
 
 
 class Message(NamedTuple):
@@ -90,6 +91,8 @@ class _FlowState:
         self.host = _host(flow.source)
         self.framer = Framer(streaming=flow.is_stream)
         self.configs: dict[int, StreamConfig] = {}
+        self.fitting: dict[bytes, StreamConfig] = {}
+        """The same by the first six bytes of data frames that they fit (SYNC, FRAMESIZE, IDCODE): the short way."""
         self.borrowed: set[int] = set()
         """IDCODEs whose configuration another flow has shown."""
         self.held: dict[int, _Held] = {}
@@ -114,14 +117,21 @@ class Demux:
     def feed(self, chunk: Chunk) -> list[Message | Loss]:
         """Messages and losses that this chunk completes."""
         out: list[Message | Loss] = []
-        state = self._flows.get(chunk.flow)
+        data, arrival_ns, flow, stamp_source, lost_before = chunk
+        state = self._flows.get(flow)
         if state is None:
             if len(self._flows) >= FLOWS:
                 out += self.end(next(iter(self._flows)))
-            state = self._flows[chunk.flow] = _FlowState(chunk.flow)
-        self.tally.fed += len(chunk.data)
-        for item in state.framer.feed(chunk.data, chunk.arrival_ns, chunk.stamp_source, chunk.lost_before):
-            self._take(state, item, out)
+            state = self._flows[flow] = _FlowState(flow)
+        tally = self.tally
+        tally.fed += len(data)
+        for item in state.framer.feed(data, arrival_ns, stamp_source, lost_before):
+            if isinstance(item, Frame) and (config := state.fitting.get(item.data[:6])) is not None:
+                tally.framed += len(item.data)
+                tally.frames[FrameType.DATA] += 1
+                out.append(_new(Message, (item, flow, config)))
+            else:
+                self._take(state, item, out)
         return out
 
     def end(self, flow: Flow) -> list[Message | Loss]:
@@ -182,6 +192,8 @@ class Demux:
                 if config is None:
                     self._hold(state, item, out)
                     return
+            else:
+                state.fitting[item.data[:6]] = config
             self._emit(Message(item, state.flow, config), kind, out)
         elif kind.is_config:
             self._configure(state, item, kind, out)
@@ -228,10 +240,12 @@ class Demux:
         place = (state.host, config.idcode)
         if current is None or current != config:
             state.configs[config.idcode] = config
+            state.fitting.clear()
             state.borrowed.discard(config.idcode)
             for other in self._borrowers.pop(place, {}).values():  # they look again
                 if config.idcode in other.borrowed:
                     del other.configs[config.idcode]
+                    other.fitting.clear()
                     other.borrowed.discard(config.idcode)
         self._configs.setdefault(place, {})[state.flow] = state.configs[config.idcode]
         for other in list(self._waiting.get(place, {}).values()):

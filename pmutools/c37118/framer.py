@@ -11,6 +11,7 @@ behind it whose first six bytes (SYNC, FRAMESIZE, IDCODE) this flow has shown be
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -60,9 +61,16 @@ class Skipped(NamedTuple):
 
 _TYPES = tuple(FrameType)
 _AA = 0xAA
+_SYNC = re.compile(rb"\xaa(?:[\x00-\x5f\x83\x93\xa3\xb3\xc3\xd3\xe3\xf3]|\Z)", re.DOTALL)
 _COMMAND_SIZE = 18
 _KNOWN_HEADS = 64
 """How many distinct (SYNC, FRAMESIZE, IDCODE) a flow remembers as proven."""
+
+
+def _next_sync(buffer: bytes, at: int, end: int) -> int:
+    """Where the next SYNC of a known type may begin; ``end`` if nowhere."""
+    found = _SYNC.search(buffer, at, end)
+    return found.start() if found else end
 
 
 class Framer:
@@ -76,7 +84,10 @@ class Framer:
         self.streaming = streaming
         self._buffer = b""
         self._offset = 0
-        self._heads: dict[bytes, None] = {}
+        self._heads: dict[bytes, int] = {}
+        """FRAMESIZE of the kinds of frame shown, by their first six bytes."""
+        self._searched: dict[bytes, int] = {}
+        """Offset up to which the flow has been searched for each of them."""
         self._open: Skipped | None = None
 
     @property
@@ -96,18 +107,11 @@ class Framer:
         ``lost_before`` says that so many bytes of the flow are missing before ``data``: what was held back is given
         up, and offsets go on counting the bytes seen.
         """
-        if not self._buffer and not lost_before:
-            size = len(data)
-            if (
-                size >= MIN_FRAME_SIZE
-                and data[2] << 8 | data[3] == size
-                and self._open is None
-                and data[:6] in self._heads
-                and not chk(data)
-            ):  # the usual case: one whole frame of a kind seen before
-                frame = Frame(data, arrival_ns, stamp_source, self._offset)
-                self._offset += size
-                return [frame]
+        size = self._heads.get(data[:6])
+        if size == len(data) and not (self._buffer or lost_before or self._open) and not chk(data):
+            frame = Frame(data, arrival_ns, stamp_source, self._offset)  # the usual case: one of a kind seen before
+            self._offset += size
+            return [frame]
         out: list[Frame | Skipped] = []
         if lost_before:
             self._scan(out, None, stamp_source, final=True)
@@ -149,15 +153,14 @@ class Framer:
     def _judge(self, buffer: bytes, at: int, end: int, final: bool) -> tuple[SkipReason | None, int]:
         """What begins at ``at``: (None, size) a frame, (reason, n) n bytes to skip, (None, 0) more bytes needed."""
         if buffer[at] != _AA:
-            sync = buffer.find(b"\xaa", at, end)
-            return SkipReason.NO_SYNC, (sync if sync >= 0 else end) - at
+            return SkipReason.NO_SYNC, _next_sync(buffer, at + 1, end) - at
         if end - at < 4:
             return (SkipReason.TRUNCATED, 1) if final else (None, 0)
         second = buffer[at + 1]
         size = buffer[at + 2] << 8 | buffer[at + 3]
         newer = second & 0x80 and second & 0xF == 3
         if not newer and (second & 0x80 or second >> 4 >= len(_TYPES)):
-            return SkipReason.BAD_TYPE, 1
+            return SkipReason.BAD_TYPE, _next_sync(buffer, at + 1, end) - at
         if size < (_COMMAND_SIZE if second >> 4 == FrameType.COMMAND else MIN_FRAME_SIZE):
             return SkipReason.BAD_SIZE, 1
         if at + size > end:
@@ -172,23 +175,27 @@ class Framer:
         head = buffer[at : at + 6]
         if head not in self._heads:
             while len(self._heads) >= _KNOWN_HEADS:
-                del self._heads[next(iter(self._heads))]
-            self._heads[head] = None
+                oldest = next(iter(self._heads))
+                del self._heads[oldest]
+                self._searched.pop(oldest, None)
+            self._heads[head] = size
         return None, size
 
     def _proven_behind(self, buffer: bytes, at: int, end: int) -> int:
-        """Where a complete good frame of a proven kind begins behind an unproven candidate; 0 if there is none."""
+        """Where a complete good frame of a proven kind begins behind an unproven candidate; 0 if there is none.
+
+        What was searched once is not searched again, however small the pieces in which the input comes.
+        """
         if buffer[at : at + 6] in self._heads:
             return 0
         first = 0
-        for head in self._heads:
-            size = head[2] << 8 | head[3]
-            found = buffer.find(head, at + 1, end)
-            while found >= 0 and found + size <= end:
-                if not chk(buffer[found : found + size]):
-                    first = min(first, found) if first else found
-                    break
+        for head, size in self._heads.items():
+            found = buffer.find(head, max(at + 1, self._searched.get(head, 0) - self._offset), end)
+            while 0 <= found <= end - size and chk(buffer[found : found + size]):
                 found = buffer.find(head, found + 1, end)
+            if 0 <= found <= end - size:
+                first = min(first, found) if first else found
+            self._searched[head] = self._offset + (found if found >= 0 else end - len(head) + 1)
         return first
 
     def _skip(self, reason: SkipReason, offset: int, nbytes: int) -> None:

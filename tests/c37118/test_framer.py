@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pmutools.c37118 import Frame, Framer, Skipped, SkipReason, encode_command, encode_header
+from pmutools.c37118 import framer as framer_module
 from pmutools.c37118.checksum import chk
 
 FRAMES = [encode_command(7, 2), encode_header(7, "a device"), encode_command(7, 8, extended=b"\xaa\x01\xff\xff" * 9)]
@@ -112,3 +113,43 @@ def test_hostile_input_is_bounded_in_memory(hostile: bytes) -> None:
     items = framer.feed(hostile)
     assert framer.pending <= 0xFFFF
     assert accounted(items + framer.close()) == len(hostile)
+
+
+LONG = encode_header(7, "x" * 3000)
+LYING = b"\xaa\x01\xff\xff"
+
+
+@pytest.mark.parametrize("piece", [1, 7, 1400, 1 << 20])
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        pytest.param(LYING + LONG[:6] * 1500, id="beginnings of a known frame behind a false SYNC"),
+        pytest.param(LYING + LONG[:-1] * 3, id="known frames without their end"),
+        pytest.param(b"\xaa\x01\x10\x00" * 2000, id="a SYNC every four bytes"),
+        pytest.param(b"\xaa" * 8000, id="half a SYNC every byte"),
+    ],
+)
+def test_no_byte_begins_more_than_two_checks(monkeypatch: pytest.MonkeyPatch, hostile: bytes, piece: int) -> None:
+    """However the input is cut: once as it is looked for behind an unproven candidate, once as its turn comes."""
+    checks = 0
+
+    def counted(data: bytes) -> int:
+        nonlocal checks
+        checks += 1
+        return chk(data)
+
+    framer = Framer(streaming=True)
+    assert frames_of(framer.feed(LONG)) == [LONG]
+    monkeypatch.setattr(framer_module, "chk", counted)
+    items = [item for at in range(0, len(hostile), piece) for item in framer.feed(hostile[at : at + piece])]
+    items += framer.close()
+    assert sum(item.nbytes if isinstance(item, Skipped) else len(item.data) for item in items) == len(hostile)
+    assert checks <= 2 * (hostile.count(b"\xaa\x01") + hostile.count(LONG[:2]))
+
+
+@given(st.binary(max_size=300).map(lambda noise: noise.replace(b"\x00", b"\xaa").replace(b"\x01", b"\xaa\x83")))
+def test_a_frame_behind_half_syncs_is_found(noise: bytes) -> None:
+    framer = Framer(streaming=True)
+    framer.feed(FRAMES[0])
+    items = framer.feed(noise + FRAMES[0]) + framer.close()
+    assert frames_of(items)[-1:] == FRAMES[:1]
