@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from dcon.core.params import Params
+from dcon.core.pmu import end_run
 from dcon.core.state import State, initial_state
 from dcon.core.step import step
 from dcon.core.values import Event, Inputs, Mode, Order, Record, Sample
@@ -41,14 +42,17 @@ class Engine:
         self.bindings: dict[str, Binding] = {}
         self.unread: dict[str, int] = {}
         """Frames that could not be read, by PMU: no configuration yet, or not of its configuration."""
+        self.configs: dict[str, StreamConfig] = {}
+        """Newest configuration of each PMU, usable or not."""
         self._notes: list[Event] = []
 
     def configure(self, name: str, config: StreamConfig) -> None:
-        """A PMU's configuration came. Raises SettingsError where the PMU cannot be used with it."""
-        site = self.sites[self._index[name]]
-        if (bound := self.bindings.get(name)) is not None and bound.config == config:
-            return
+        """A PMU's configuration came. Raises SettingsError where the PMU cannot be used with it: it is then unread."""
+        self.configs[name] = config
         self.bindings.pop(name, None)
+        if name not in self._index:
+            raise SettingsError(f"no PMU {name!r} in the settings; there are {', '.join(self._index)}")
+        site = self.sites[self._index[name]]
         self.bindings[name] = bind(
             name,
             config,
@@ -59,29 +63,40 @@ class Engine:
         )
 
     def reconfigure(self, name: str, config: StreamConfig) -> str | None:
-        """:meth:`configure` in a running session: trouble becomes an event of the next tick, and is returned."""
+        """:meth:`configure` in a running session: a change is an event of the next tick; trouble is also returned.
+
+        Where frames are read otherwise from now on, the PMU starts again, and its instances are verified anew.
+        """
+        known, bound = self.configs.get(name), self.bindings.get(name)
+        if known == config:
+            return None
         try:
             self.configure(name, config)
         except SettingsError as error:
             self._notes.append(Event("config_unusable", name, str(error)))
             return str(error)
+        if known is not None:
+            self._notes.append(Event("config_changed", name, f"data frames of {config.frame_size} bytes"))
+            if bound is None or not bound.reads_like(self.bindings[name]):
+                self._restart(self._index[name])
         return None
+
+    def _restart(self, index: int) -> None:
+        pmus = self.state.pmus
+        self.state = self.state._replace(pmus=(*pmus[:index], end_run(pmus[index]), *pmus[index + 1 :]))
 
     def tick(self, frames: Mapping[str, Iterable[Frame]], orders: tuple[Order, ...], now_ns: int) -> Tick:
         """Run one tick at ``now_ns`` with the data frames of each PMU that arrived since the last, in order."""
         samples: list[list[Sample]] = [[] for _ in self.sites]
         logged: list[PmuFrame] = []
         for name, arrived in frames.items():
-            binding, into = self.bindings.get(name), samples[self._index[name]]
+            binding = self.bindings.get(name)
             for frame in arrived:
-                try:
-                    read = binding.read(frame) if binding is not None else None
-                except WireError:
-                    read = None
+                read = None if binding is None else _read(binding, frame)
                 if read is None:
                     self.unread[name] = self.unread.get(name, 0) + 1
                 else:
-                    into.append(read[0])
+                    samples[self._index[name]].append(read[0])
                     logged.append(read[1])
         inputs = Inputs(tuple(map(tuple, samples)), orders)
         self.state, record = step(self.params, self.state, inputs, now_ns)
@@ -89,3 +104,10 @@ class Engine:
             record = record._replace(events=(*self._notes, *record.events))
             self._notes = []
         return Tick(record, tuple(logged))
+
+
+def _read(binding: Binding, frame: Frame) -> tuple[Sample, PmuFrame] | None:
+    try:
+        return binding.read(frame)
+    except WireError:
+        return None

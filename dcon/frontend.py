@@ -41,11 +41,23 @@ class Binding:
         )
         return sample, pmu_frame(self.name, frame, data, station=self.station, v1=v1)
 
+    def reads_like(self, other: Binding) -> bool:
+        """Whether both make the same sample of every frame."""
+        return (self.station, self.voltage, *_meaning(self.layout)) == (
+            other.station,
+            other.voltage,
+            *_meaning(other.layout),
+        )
+
     def v1(self, data: Data) -> complex:
         """Positive-sequence voltage, V RMS."""
         if len(self.voltage) == 1:
             return data.phasor(self.voltage[0])
         return positive_sequence(*map(data.phasor, self.voltage))
+
+
+def _meaning(layout: Layout) -> tuple[object, ...]:
+    return layout.stations, layout.slots, layout.phasors, layout.time_base
 
 
 def bind(
@@ -64,7 +76,7 @@ def bind(
     rate_hz
         Reporting rate that the controller runs at.
     voltage
-        Name of the positive-sequence channel, or those of phases A, B and C.
+        Name of the positive-sequence channel, or three: of phases A, B and C.
     station
         Name of the station in a stream that has several.
 
@@ -84,8 +96,6 @@ def bind(
         raise SettingsError(
             f"PMU {name}: station {chosen.name} measures a {chosen.fnom_hz:g} Hz grid, not {nominal_hz:g} Hz"
         )
-    if len(voltage) not in (1, 3):
-        raise SettingsError(f"PMU {name}: voltage names {len(voltage)} channels; give V1, or VA,VB,VC")
     first = layout_of(config).slots[index].phasor_columns.start
     channels = [channel.name for channel in chosen.phasors]
     columns = []
