@@ -25,6 +25,7 @@ STALL_NS = 10_000_000_000
 """A client that takes nothing for so long while bytes wait for it is disconnected."""
 _BACKLOG = 1024
 _VANISHED_MS = 30_000
+_LAST_READS = 16
 
 
 class TcpClient:
@@ -62,6 +63,14 @@ class TcpClient:
         return self._sock.fileno()
 
     def close(self) -> None:
+        """End the connection; what has come is read first, as closing over unread bytes would reset it."""
+        try:
+            self._sock.shutdown(socket.SHUT_WR)
+            for _ in range(_LAST_READS):
+                if not self._sock.recv_into(self._buffer):
+                    break
+        except OSError:  # nothing more has come, or there is no connection
+            pass
         self._sock.close()
 
     def finish(self) -> None:

@@ -269,9 +269,11 @@ def test_a_slow_client_neither_delays_others_nor_grows_memory() -> None:
         server.until(lambda: len(fast.hear()) == 8000)
         assert failed > 0  # the slow one's queue was full
         assert sorted(spent_ns)[7920] < 5 * MS  # no send waited for it
+        assert 0 < server.senders.queued_bytes <= 32_768
         got = len(slow.hear())
         server.until(lambda: len(slow.hear()) == 8000 - failed)  # it gets the rest when it reads, frames whole
         assert got < 8000
+        server.until(lambda: not server.senders.queued_bytes)
 
 
 def test_a_stalled_client_is_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,6 +201,19 @@ def test_ends_of_connections_are_told_apart() -> None:
     close(listener, peer)
 
 
+def test_a_last_command_arrives_although_data_were_left_unread() -> None:
+    listener, client, peer = connected()
+    peer.put(FRAMES[0], 0)
+    time.sleep(0.01)
+    assert client.send(b"stop")
+    client.close()
+    heard: list[bytes] = []
+    with pytest.raises(BrokenPipeError):  # FIN, not RST
+        wait(lambda: heard.append(peer.read()))
+    assert b"".join(heard) == b"stop"
+    close(listener, peer)
+
+
 def test_a_refused_connection_says_so() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
