@@ -18,6 +18,8 @@ from dcon.core.values import Sample, SystemState
 
 
 class Scope(StrEnum):
+    """Whom a check concerns."""
+
     PMU = "pmu"
     INSTANCE = "instance"
     SYSTEM = "system"

@@ -63,10 +63,12 @@ _MODE_ORDERS: Final = {str(mode): mode for mode in Mode}
 
 
 def trigger_of(order: str) -> Trigger | None:
+    """The trigger that an order is; None for one that is none."""
     return _TRIGGER_ORDERS.get(order)
 
 
 def mode_of(order: str) -> Mode | None:
+    """The mode that an order asks for; None for one that asks for none."""
     return _MODE_ORDERS.get(order)
 
 
@@ -79,6 +81,8 @@ class ArmView(NamedTuple):
 
 
 class Permissive(NamedTuple):
+    """One condition of arming."""
+
     name: str
     test: Callable[[Params, ArmView], bool]
     """True allows."""

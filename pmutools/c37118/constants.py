@@ -118,6 +118,7 @@ STAT_ABSENT = 0x8000
 
 
 def stat_data_error(stat: int) -> DataError:
+    """Data error, bits 15-14."""
     return DataError(stat >> 14 & 3)
 
 
@@ -132,6 +133,7 @@ def stat_unlocked_time(stat: int) -> int:
 
 
 def stat_trigger_reason(stat: int) -> int:
+    """Trigger reason, bits 3-0; see :class:`TriggerReason`."""
     return stat & 0xF
 
 

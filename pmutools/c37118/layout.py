@@ -49,6 +49,8 @@ class PhasorSlot(NamedTuple):
 
 
 class AnalogSlot(NamedTuple):
+    """How to read one analog: the value at place ``at``, times ``multiplier``, plus ``offset``."""
+
     at: int
     multiplier: float
     offset: float

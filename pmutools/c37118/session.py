@@ -23,6 +23,8 @@ from pmutools.timebase import NS, from_ns
 
 
 class ClientState(StrEnum):
+    """Where a client stands with one stream."""
+
     IDLE = "idle"
     """No transport."""
     WAIT_CFG3 = "wait-cfg3"
@@ -33,6 +35,8 @@ class ClientState(StrEnum):
 
 
 class ClientEvent(StrEnum):
+    """What a client can meet."""
+
     OPENED = "opened"
     CLOSED = "closed"
     CONFIG = "config"
@@ -48,6 +52,8 @@ class ClientEvent(StrEnum):
 
 
 class ClientAction(StrEnum):
+    """What the client's owner is to do."""
+
     REQUEST_CFG3 = "request-cfg3"
     REQUEST_CFG2 = "request-cfg2"
     SEND_START = "send-start"
@@ -59,6 +65,8 @@ class ClientAction(StrEnum):
 
 
 class Step(NamedTuple):
+    """What a table answers: the next state, and what to do, in order."""
+
     state: ClientState
     actions: tuple[ClientAction, ...] = ()
 
@@ -265,6 +273,8 @@ class SendState(StrEnum):
 
 
 class Reply(NamedTuple):
+    """What the server's table answers: the stream's state towards this client from now on."""
+
     state: SendState
     frame: FrameType | None = None
     """What is sent back."""
@@ -328,6 +338,8 @@ class Outcome(StrEnum):
 
 
 class Answer(NamedTuple):
+    """What came of a client's frame, and what to send back."""
+
     outcome: Outcome
     idcode: int
     code: int = 0

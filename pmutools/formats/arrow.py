@@ -58,4 +58,5 @@ class ArrowRows:
 
 
 def create(path: Path, options: SinkOptions) -> TableSink:
+    """Begin an Arrow table."""
     return TableSink(path, ".arrow", ArrowRows, options)

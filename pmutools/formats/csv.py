@@ -125,5 +125,6 @@ def _plain(kind: Any) -> Any:
 
 
 def create(path: Path, options: SinkOptions) -> TableSink:
+    """Begin a CSV table."""
     compression = path.suffix if path.suffix.lower() in (".gz", ".zst") else ""
     return TableSink(path, f".csv{compression}", CsvRows, options)

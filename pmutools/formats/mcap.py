@@ -93,4 +93,5 @@ def _name(config: StreamConfig) -> str:
 
 
 def create(path: Path, options: SinkOptions) -> LogSink:
+    """Begin a log."""
     return LogSink(path)

@@ -82,4 +82,5 @@ class ParquetRows:
 
 
 def create(path: Path, options: SinkOptions) -> TableSink:
+    """Begin a Parquet table."""
     return TableSink(path, ".parquet", ParquetRows, options)

@@ -74,4 +74,5 @@ class CaptureSink(FrameSink):
 
 
 def create(path: Path, options: SinkOptions) -> CaptureSink:
+    """Begin a capture; the suffix says which kind."""
     return CaptureSink(path)

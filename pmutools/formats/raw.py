@@ -58,4 +58,5 @@ class RawSink(FrameSink):
 
 
 def create(path: Path, options: SinkOptions) -> RawSink:
+    """Begin a file of frames."""
     return RawSink(path)

@@ -9,11 +9,15 @@ from pmutools.net.udp import Target, UdpSocket
 
 
 class Sink(Protocol):
+    """Takes the frames of the streams that it was given."""
+
     def put(self, frame: bytes, mark: int, now_ns: int) -> bool:
         """Take a frame, the one at ``mark`` in what is published; false if it was dropped at once."""
 
 
 class Flushable(Protocol):
+    """Has put off what a system call is to do for all at once."""
+
     def flush(self) -> list[int]:
         """Do what was put off; returns the marks of the frames that failed in it."""
 
@@ -45,6 +49,8 @@ class Outbox:
 
 
 class UdpSink:
+    """One destination of datagrams, through the outbox of a socket."""
+
     __slots__ = ("outbox", "where")
 
     def __init__(self, outbox: Outbox, where: Target) -> None:

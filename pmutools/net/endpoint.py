@@ -26,6 +26,8 @@ from pmutools.errors import SettingsError
 
 
 class Scheme(StrEnum):
+    """How commands and data travel."""
+
     UDP = "udp"
     UDP_COMMANDED = "udp+cmd"
     TCP = "tcp"
@@ -66,6 +68,7 @@ class Endpoint:
 
 
 def is_multicast(host: str) -> bool:
+    """Whether ``host`` is the address of a group."""
     try:
         return ipaddress.ip_address(host).is_multicast
     except ValueError:

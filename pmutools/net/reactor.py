@@ -18,6 +18,8 @@ WRITE = selectors.EVENT_WRITE
 
 
 class HasFileno(Protocol):
+    """What a selector can wait for."""
+
     def fileno(self) -> int: ...
 
 
@@ -33,6 +35,8 @@ class Timer:
 
 
 class Reactor:
+    """The loop: sockets and timers, and who is called for them."""
+
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._selector = selectors.DefaultSelector()

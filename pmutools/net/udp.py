@@ -46,6 +46,7 @@ class Target(NamedTuple):
 
 
 def target(address: Address) -> Target:
+    """``address`` as the system call takes it."""
     return Target(address, linux.SockAddr(pack_sockaddr(address)))
 
 
