@@ -15,7 +15,7 @@ SHORTEST_S = 48.0
 
 
 @click.command(name="demo", short_help="The whole chain live on this machine: open loop, then closed loop.")
-@click.option("--duration", type=click.FloatRange(SHORTEST_S, 600), metavar="S", help="Longer swings; 54 s by default.")
+@click.option("--duration", type=click.FloatRange(SHORTEST_S, 600), metavar="S", help="Longer swings; 56 s by default.")
 @click.option("--out", default="demo", show_default=True, type=click.Path(path_type=Path, file_okay=False))
 @click.option("--gain", type=click.FloatRange(0, 15), default=12.0, show_default=True, metavar="K", help="MW/mHz.")
 @click.option("--impair", default="table1", show_default=True, metavar="PROFILE", help="What happens on the network.")
@@ -47,7 +47,10 @@ def command(
         click.echo(json.dumps(summary))
     else:
         click.echo(_table(summary, gain))
-        click.echo(f"session log {demo.log_path}, summary {out / 'summary.json'}, picture {summary['picture'] or '-'}")
+        picture = f", picture {summary['picture']}" if summary["picture"] else ""
+        click.echo(f"session log {demo.log_path}, summary {out / 'summary.json'}{picture}")
+    if summary["picture"] is None:
+        talk.say("no picture: matplotlib is not installed; pip install 'pmutools[analysis]' brings it")
     opened, closed = summary["open_loop"], summary["closed_loop"]
     if opened is None or closed is None:
         click.echo("dcon demo: the swings could not be judged; is the machine overloaded?", err=True)

@@ -34,7 +34,7 @@ SWEEP_LIMIT = 10_000
 @click.option("--no-align", is_flag=True, help="Do not align on time stamps (to see why one must).")
 @click.option("--interpolate", is_flag=True, help="Bridge single lost frames by their midpoint.")
 @click.option(
-    "--duration", type=click.FloatRange(0, 86400, min_open=True), metavar="S", help="Default: the scenario's."
+    "--duration", type=click.FloatRange(0, 86400, min_open=True), metavar="S", help="Default: until all is seen."
 )
 @click.option("--seed", type=int, default=1, show_default=True, metavar="N")
 @click.option("--sweep", "sweeps", multiple=True, metavar="NAME=FROM:TO:STEP", help="gain, delay, deadband or seed.")
@@ -64,25 +64,20 @@ def command(
 
     With --sweep, one line a run. With --out, each run leaves its session log there.
     """
-    from dcon.sim.faults import fault
     from dcon.sim.plan import Plan
     from dcon.sim.simulate import simulate
     from pmutools.impair.profile import Profile
     from pmutools.impair.profiles import load_profile
 
     talk = Talk(quiet, verbose)
-    profile = Profile()
-    for name in faults:
-        profile = profile.then(fault(name))
-    if impair is not None:
-        profile = profile.then(load_profile(impair))
     plan = Plan(
         scenario=scenario_name,
         plant=plant,
         gain_mw_per_mhz=gain,
         delay_ms=delay,
         deadband_mhz=deadband,
-        profile=profile,
+        faults=faults,
+        profile=Profile() if impair is None else load_profile(impair),
         control=not no_control,
         align=not no_align,
         interpolate_single_loss=interpolate,
@@ -124,7 +119,7 @@ def _axis(text: str) -> tuple[str, list[float]]:
         count = int((last - first) / step + 1e-9) + 1
     except (ValueError, ZeroDivisionError, OverflowError):
         equals = ""
-    if not equals or name not in SWEPT or not 0 < count <= SWEEP_LIMIT:
+    if not equals or name not in SWEPT or first < 0 or not 0 < count <= SWEEP_LIMIT:
         raise SettingsError(f"--sweep {text}: write {'|'.join(SWEPT)}=FROM:TO:STEP, as in gain=0:15:3")
     values = [first + step * number for number in range(count)]
     return SWEPT[name], [int(value) for value in values] if name == "seed" else values

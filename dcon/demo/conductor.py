@@ -63,10 +63,10 @@ def free_ports(count: int) -> int:
 
 
 def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, seconds: None) -> dict[str, Any]:
-    """Run the demo and write ``session.mcap``, ``summary.json`` and ``dcon.ini`` into ``demo.out``.
+    """Run the demo and leave ``session.mcap``, ``summary.json``, ``demo.png`` and ``dcon.ini`` in ``demo.out``.
 
-    ``tell`` is given what is going on and the seconds from the start. Raises DemoError where a process fails,
-    SourceError where the folder cannot be written.
+    ``tell`` is given what is going on and the seconds from the start. Returns what :func:`report` does. Raises
+    DemoError where a process fails, SourceError where the folder cannot be written.
     """
     pmus, course = fleet(), demo.course
     base = free_ports(len(pmus) + 1)
@@ -79,6 +79,7 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
                 pmus,
                 gain_mw_per_mhz=demo.gain_mw_per_mhz,
                 deadband_mhz=0.0,
+                init_s=course.init_s,
                 urls=[f"udp://127.0.0.1:{pmu_port + number}" for number in range(len(pmus))],
                 extra=f"\n[output]\nurl = udp://127.0.0.1:{command_port}\n",
             )
@@ -86,11 +87,10 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
     except OSError as error:
         raise SourceError(f"--out {demo.out}: {error.strerror}") from None
     start_ns = (time.time_ns() // timebase.NS + 1) * timebase.NS + round(LEAD_S * timebase.NS)
-    processes = {
-        "controller": _launch(_controller(demo, ini, start_ns)),
-        "grid": _launch(_grid(demo, start_ns, command_port, pmu_port)),
-    }
+    processes: dict[str, subprocess.Popen[str]] = {}
     try:
+        processes["controller"] = _launch(_controller(demo, ini, start_ns))
+        processes["grid"] = _launch(_grid(demo, start_ns, command_port, pmu_port))
         _wait(processes, start_ns, course, tell)
     finally:
         for process in processes.values():
@@ -99,15 +99,26 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
         for process in processes.values():
             _reap(process)
     tell("reading the session log", course.end_s)
+    return report(demo, start_ns)
+
+
+def report(demo: Demo, start_ns: int) -> dict[str, Any]:
+    """Judge the session that began at ``start_ns``: writes ``summary.json`` and the picture, returns the summary.
+
+    ``picture`` in it is null where matplotlib is not installed.
+    """
     traces = read_traces(str(demo.log_path), start_ns)
-    summary = summarise(traces, course, demo.gain_mw_per_mhz)
-    (demo.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    summary = summarise(traces, demo.course, demo.gain_mw_per_mhz)
     try:
         from dcon.demo.picture import draw
     except ImportError:
         summary["picture"] = None
     else:
-        summary["picture"] = str(draw(traces, summary, course, demo.out / "demo.png"))
+        summary["picture"] = str(draw(traces, summary, demo.course, demo.out / "demo.png"))
+    try:
+        (demo.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    except OSError as error:
+        raise SourceError(f"--out {demo.out}: {error.strerror}") from None
     return summary
 
 

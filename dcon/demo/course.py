@@ -12,8 +12,6 @@ BRAKE_S = 0.5
 SETTLE_S = 1.0
 """From the end of a brake to where its ringdown is judged."""
 JUDGED_S = 12.0
-INIT_S = 20.0
-"""Verified data before an instance may be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +22,8 @@ class Course:
     """First brake; the instances have been verified by then."""
     swing_s: float = 14.0
     """From a brake until the next thing happens."""
+    init_s: float = 20.0
+    """Verified data before an instance may be used."""
 
     @property
     def arm_s(self) -> float:

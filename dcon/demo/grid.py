@@ -20,7 +20,7 @@ from pmutools.errors import PmuError
 from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.grid import Grid
 from pmutools.grid.plant import build
-from pmutools.grid.pmu_model import PmuModel, fleet, measure
+from pmutools.grid.pmu_model import fleet, measure
 from pmutools.impair.outgoing import Fate
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profiles import load_profile
@@ -47,21 +47,19 @@ class LiveGrid:
         self.senders = Senders(self.clock)
         self.pmus = fleet(noise_rad=noise_rad, seed=seed)
         faults = load_profile(profile)
-        self.streams, self.handles, self.pipelines = [], [], []
+        self.streams: list[EmulatedStream] = []
+        self.handles: list[int] = []
+        self.pipelines: list[Pipeline] = []
         for number, pmu in enumerate(self.pmus):
             stream = EmulatedStream([pmu], RATE)
             handle = self.senders.add(served(stream.config))
             self.senders.send_to(parse_endpoint(f"udp://127.0.0.1:{pmu_port + number}"), [handle])
             self.streams.append(stream)
             self.handles.append(handle)
-            self.pipelines.append(self._pipeline(pmu, stream, faults, seed))
+            names = (str(pmu.idcode), pmu.bus)
+            self.pipelines.append(Pipeline(faults, pmu.name, seed, config=stream.config, aliases=names))
         self.last_sequence = -1
         self.last_command_ns = 0
-        self.applied_mw = 0.0
-
-    def _pipeline(self, pmu: PmuModel, stream: EmulatedStream, faults: object, seed: int) -> Pipeline:
-        names = (str(pmu.idcode), pmu.bus)
-        return Pipeline(faults, pmu.name, seed, config=stream.config, aliases=names)  # type: ignore[arg-type]
 
     def run(self) -> None:
         """From the start to the end of the course, in real time."""
@@ -108,12 +106,12 @@ class LiveGrid:
                 continue
             self.last_sequence = command.sequence
             self.last_command_ns = chunk.arrival_ns or command.time_ns
-            self.applied_mw = command.command_mw
             self.grid.command(command.command_mw, self.last_command_ns)
 
     def _silence(self, now_ns: int) -> None:
-        if self.applied_mw and now_ns - self.last_command_ns > SILENCE_NS:
-            self.applied_mw = 0.0
+        """The line goes back to its schedule, and the next to command may begin its sequence anew."""
+        if self.last_sequence >= 0 and now_ns - self.last_command_ns > SILENCE_NS:
+            self.last_sequence = -1
             self.grid.command(0.0, now_ns)
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from dcon.core.differentiator import EMPTY, advance, coefficients
 from dcon.demo.course import Course
+from dcon.limiter import MW_PER_V
 from dcon.session.log import SessionReader
 from pmutools import timebase
 from pmutools.modal.matrix_pencil import ringdown
@@ -60,7 +61,7 @@ def read_traces(path: str, start_ns: int, north: str = "N1", south: str = "S1") 
         record, timing = tick.record, tick.timing
         late, compute = (timing.late_us, timing.compute_us) if timing else (math.nan, math.nan)
         seconds = (record.tick_ns - start_ns) / timebase.NS
-        ticks.append((seconds, record.command_mw, record.output_v * 12.5, late, compute))
+        ticks.append((seconds, record.command_mw, record.output_v * MW_PER_V, late, compute))
         state = str(record.state)
     stamps = sorted(angles[north].keys() & angles[south].keys())
     delta = _difference([angles[north][s] - angles[south][s] for s in stamps])

@@ -11,8 +11,10 @@ from __future__ import annotations
 import socket
 import struct
 import zlib
+from contextlib import suppress
 from typing import NamedTuple
 
+from dcon.limiter import MW_PER_V
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.sockets import explain, resolve
 
@@ -20,7 +22,6 @@ MAGIC = b"DCN1"
 _BODY = struct.Struct(">4sIqddI")
 _CRC = struct.Struct(">I")
 SIZE = _BODY.size + _CRC.size
-MW_PER_V = 12.5
 
 
 class CommandOut(NamedTuple):
@@ -57,7 +58,7 @@ def decode(datagram: bytes) -> CommandOut | None:
 
 
 class UdpCommandDriver:
-    """Sends commands to one endpoint; what the system refuses is counted, never raised."""
+    """Sends commands to one endpoint; what the system refuses, or nobody listens to, is counted and never raised."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         """Raises SourceError for a host that is unknown or unreachable."""
@@ -73,11 +74,16 @@ class UdpCommandDriver:
 
     def send(self, time_ns: int, output_v: float, flags: int = 0) -> None:
         """Drive ``output_v`` volts from now on."""
+        datagram = encode(CommandOut(self._sequence, time_ns, output_v * MW_PER_V, output_v, flags))
+        self._sequence += 1
         try:
-            self._sock.send(encode(CommandOut(self._sequence, time_ns, output_v * MW_PER_V, output_v, flags)))
+            self._sock.send(datagram)
+        except ConnectionRefusedError:  # tells of the one before, and this one has not left
+            self.failed += 1
+            with suppress(OSError):
+                self._sock.send(datagram)
         except OSError:
             self.failed += 1
-        self._sequence += 1
 
     def close(self) -> None:
         self._sock.close()

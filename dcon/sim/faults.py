@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from pmutools.errors import SettingsError
 from pmutools.impair.profile import Profile, parse_profile
 from pmutools.impair.profiles import ready_profile
 from pmutools.parsers import suggestion
 
-_READY: Final = {
-    "two-zero-arrival": "two-zero",
-    "south-delay-3": "asymmetry-3",
-    "south-delay-6": "asymmetry-6",
-    "table1-delays": "table1",
-    "irregular": "fig10-irregular",
-}
-_OWN: Final = {
-    "stream-stop": "[stream N1]\ndisable = 10..40\n",
-    "all-stop": "[stream *]\ndisable = 10..\n",
-    "dropout": "[stream N1]\ndrop = 600\n",
-}
-FAULTS: Final = (*_OWN, *_READY)
+
+class Fault(NamedTuple):
+    """An impairment profile, and how long a run must be to show all of what it does."""
+
+    profile: Profile
+    shown_s: float = 0.0
 
 
-def fault(name: str) -> Profile:
+def _own(text: str) -> Profile:
+    return parse_profile(text, "fault")
+
+
+FAULTS: Final = {
+    "stream-stop": Fault(_own("[stream N1]\ndisable = 10..40\n"), shown_s=65.0),
+    "all-stop": Fault(_own("[stream *]\ndisable = 10..\n")),
+    "dropout": Fault(_own("[stream N1]\ndrop = 600\n")),
+    "two-zero-arrival": Fault(ready_profile("two-zero")),
+    "south-delay-3": Fault(ready_profile("asymmetry-3")),
+    "south-delay-6": Fault(ready_profile("asymmetry-6")),
+    "table1-delays": Fault(ready_profile("table1")),
+    "irregular": Fault(ready_profile("fig10-irregular")),
+}
+"""N1 is the north PMU of the pair that a simulated session begins with."""
+
+
+def fault(name: str) -> Fault:
     """The fault ``name``. Raises SettingsError for one that there is not."""
-    if name in _READY:
-        return ready_profile(_READY[name])
-    if name not in _OWN:
+    if name not in FAULTS:
         raise SettingsError(f"no fault {name!r}; {suggestion(name, FAULTS)}")
-    return parse_profile(_OWN[name], f"fault {name}")
+    return FAULTS[name]

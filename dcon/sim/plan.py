@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from dcon.sim.faults import fault
 from pmutools import timebase
 from pmutools.grid.pmu_model import PmuModel
 from pmutools.grid.scenarios import Scenario, scenario
@@ -23,8 +24,10 @@ class Plan:
     gain_mw_per_mhz: float = 9.0
     delay_ms: float = 82.0
     deadband_mhz: float = 0.0
+    faults: tuple[str, ...] = ()
+    """Faults by name, on the way from the PMUs to the controller."""
     profile: Profile = field(default_factory=Profile)
-    """Faults on the way from the PMUs to the controller."""
+    """More of them, on top."""
     control: bool = True
     """False: the controller computes and logs, and drives nothing."""
     align: bool = True
@@ -40,7 +43,18 @@ class Plan:
 
     @property
     def length_s(self) -> float:
-        return self.course.duration_s if self.duration_s is None else self.duration_s
+        """As asked for, else until the scenario and every fault have been seen whole."""
+        if self.duration_s is not None:
+            return self.duration_s
+        return max(self.course.duration_s, *(fault(name).shown_s for name in self.faults), 0.0)
+
+    @property
+    def impairment(self) -> Profile:
+        """All faults together."""
+        profile = Profile()
+        for name in self.faults:
+            profile = profile.then(fault(name).profile)
+        return profile.then(self.profile)
 
 
 def ini_of(
@@ -52,6 +66,7 @@ def ini_of(
     urls: Sequence[str] | None = None,
     align: bool = True,
     interpolate_single_loss: bool = False,
+    init_s: float = 20.0,
     extra: str = "",
 ) -> str:
     """The initialisation file of a controller fed by emulated PMUs."""
@@ -65,6 +80,7 @@ def ini_of(
         f"deadband_mhz = {deadband_mhz!r}",
         f"align = {str(align).lower()}",
         f"interpolate_single_loss = {str(interpolate_single_loss).lower()}",
+        f"init_s = {init_s!r}",
     ]
     if gain_mw_per_mhz > 15:
         law.append(f"gain_max_mw_per_mhz = {gain_mw_per_mhz!r}")

@@ -16,6 +16,7 @@ import numpy as np
 from dcon.core.rows import CORE
 from dcon.core.values import Event, Record
 from dcon.engine import Engine
+from dcon.limiter import MW_PER_V
 from dcon.session.log import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
@@ -23,6 +24,7 @@ from dcon.sim.operator import EagerOperator
 from dcon.sim.plan import START_NS, Plan, ini_of
 from pmutools import timebase
 from pmutools.c37118 import Frame
+from pmutools.errors import SettingsError
 from pmutools.flow import StampSource
 from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.grid import Grid
@@ -32,8 +34,6 @@ from pmutools.impair.outgoing import Fate
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Profile, parse_profile
 from pmutools.modal.matrix_pencil import ringdown
-
-MW_PER_V = 12.5
 
 
 class Estimate(NamedTuple):
@@ -108,10 +108,13 @@ def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
     Raises SettingsError for what the plan names and there is not, SourceError where the log cannot be written.
     """
     pmus = fleet(noise_rad=plan.noise_rad, seed=plan.seed)
+    if unmatched := plan.profile.unmatched((pmu.name, str(pmu.idcode), pmu.bus) for pmu in pmus):
+        there = ", ".join(pmu.name for pmu in pmus)
+        raise SettingsError(f"--impair: no PMU is called {unmatched[0]}; there are {there}, north and south")
     settings = settings_of(plan, pmus)
     delays = split(plan.delay_ms)
     base = parse_profile(f"[stream *]\ndelay = constant({delays.arrival_ns / 1e6!r})\n", "delay")
-    senders = [_Sender(pmu, plan, base.then(plan.profile)) for pmu in pmus]
+    senders = [_Sender(pmu, plan, base.then(plan.impairment)) for pmu in pmus]
     engine = Engine(settings.params, settings.sites, verified=True)
     configs = {}
     for sender in senders:

@@ -1,0 +1,165 @@
+"""``dcon simulate``: Table II through bytes, the delay sweep, and runs that are functions of their plan."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from dcon.cli import dcon
+from dcon.sim.delays import split
+from dcon.sim.plan import Plan
+from dcon.sim.simulate import simulate
+from pmutools.cli.shell import run
+
+Capsys = pytest.CaptureFixture[str]
+KEYS = (
+    *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "seed", "duration_s", "mode", "open_loop"),
+    *("peak_command_mw", "final_state", "events"),
+)
+
+
+def told(capsys: Capsys, *arguments: str) -> list[dict[str, object]]:
+    assert run(dcon(), ["simulate", *arguments, "--json"]) == 0
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+@pytest.mark.parametrize(("gain", "hz", "percent"), [(0, 0.425, 7.8), (9, 0.433, 10.3), (12, 0.435, 11.4)])
+def test_simulation_rows_of_table_2(gain: float, hz: float, percent: float, capsys: Capsys) -> None:
+    (result,) = told(capsys, "cjb", "--gain", str(gain))
+    mode, open_loop = result["mode"], result["open_loop"]
+    assert isinstance(mode, dict) and isinstance(open_loop, dict)
+    assert mode["frequency_hz"] == pytest.approx(hz, abs=1.5e-3)
+    assert mode["damping_percent"] == pytest.approx(percent, abs=0.15)
+    assert mode["r2"] > 0.9999
+    # the judge recovers the plant's own mode far closer than the rows are held to
+    assert open_loop["frequency_hz"] == pytest.approx(0.425, abs=1e-5)
+    assert open_loop["damping_percent"] == pytest.approx(7.8, abs=0.002)
+    assert result["final_state"] == "ACTIVE"
+    assert isinstance(result["peak_command_mw"], float) and result["peak_command_mw"] < 125.0
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "percent"), [(0, 11.73), (113, 11.09), (200, 10.31), (300, 9.16), (400, 7.86), (500, 6.57)]
+)
+def test_damping_over_delay(delay_ms: float, percent: float) -> None:
+    """The row of exact eigenvalues; an ordered delay is no fault to the controller, however long."""
+    outcome = simulate(Plan(gain_mw_per_mhz=12, delay_ms=delay_ms, duration_s=18.5))
+    assert outcome.mode is not None
+    assert outcome.mode.damping_percent == pytest.approx(percent, abs=0.02)
+    assert outcome.final_state == "ACTIVE"
+
+
+@pytest.mark.parametrize("total_ms", [0, 5, 11, 15, 22, 82, 300])
+def test_the_parts_of_a_delay_make_the_whole(total_ms: float) -> None:
+    parts = split(total_ms)
+    assert parts.total_ns == total_ms * 1_000_000
+    assert min(parts) >= 0
+    assert parts.phase_ns <= 71_000_000  # so that no frame is late, whatever the whole
+
+
+def test_json_has_the_keys_of_the_contract(capsys: Capsys) -> None:
+    (result,) = told(capsys, "cjb", "--no-control", "--duration", "12")
+    assert tuple(result) == KEYS
+    assert result["mode"] is None
+    assert isinstance(result["open_loop"], dict) and set(result["open_loop"]) >= {"frequency_hz", "damping_percent"}
+    assert (result["scenario"], result["plant"], result["gain_mw_per_mhz"]) == ("cjb", "modal", 9.0)
+    assert (result["delay_ms"], result["seed"], result["duration_s"]) == (82.0, 1, 12.0)
+    assert (result["peak_command_mw"], result["final_state"]) == (0.0, "STANDBY")
+    assert isinstance(result["events"], list)
+    assert {"time_s", "name"} <= set(result["events"][0])
+    (result,) = told(capsys, "cjb", "--duration", "1")  # over before the brake
+    assert result["mode"] is None and result["open_loop"] is None
+
+
+def test_a_run_is_a_function_of_plan_and_seed(tmp_path: Path) -> None:
+    def log(name: str, seed: int) -> bytes:
+        plan = Plan(faults=("table1-delays",), noise_rad=1e-4, duration_s=4, seed=seed)
+        simulate(plan, str(tmp_path / name))
+        return (tmp_path / name).read_bytes()
+
+    one, again, other = log("one", 1), log("again", 1), log("other", 2)
+    assert one == again
+    assert one != other
+
+
+def test_the_seed_draws_the_noise_and_the_faults() -> None:
+    def commands(seed: int) -> list[float]:
+        return simulate(Plan("ambient", noise_rad=1e-4, duration_s=3, seed=seed)).command_mw
+
+    assert commands(1) == commands(1) != commands(2)
+
+
+def test_simulated_sessions_begin_initialised_and_rows_are_consecutive(capsys: Capsys) -> None:
+    outcome = simulate(Plan(duration_s=5))
+    names = {event.name: time_s for time_s, event in reversed(outcome.events)}
+    assert names["active"] < 0.2
+    assert len(outcome.tick_s) == 300
+    assert all(b - a == pytest.approx(1 / 60, abs=1e-6) for a, b in pairwise(outcome.tick_s))
+
+
+def test_sweeps_are_one_line_a_run(capsys: Capsys) -> None:
+    rows = told(capsys, "cjb", "--sweep", "gain=0:12:6", "--sweep", "delay=82:113:31", "--duration", "12")
+    assert [(row["gain_mw_per_mhz"], row["delay_ms"]) for row in rows] == [
+        *((0.0, 82.0), (0.0, 113.0), (6.0, 82.0), (6.0, 113.0), (12.0, 82.0), (12.0, 113.0))
+    ]
+    assert run(dcon(), ["simulate", "cjb", "--sweep", "seed=1:3:1", "--duration", "1"]) == 0
+    assert [line.split(":")[0][-6:] for line in capsys.readouterr().out.splitlines()] == ["seed 1", "seed 2", "seed 3"]
+
+
+def test_the_command_saturates_and_a_gain_beyond_the_operators_is_for_simulation_only(capsys: Capsys) -> None:
+    row, over = told(capsys, "cjb", "--sweep", "gain=15:30:15", "--duration", "8")
+    assert row["gain_mw_per_mhz"] == 15.0 and over["gain_mw_per_mhz"] == 30.0
+    assert over["peak_command_mw"] == 125.0
+    assert over["final_state"] == "ACTIVE"
+
+
+def test_bc_us_separation_gains_the_papers_damping() -> None:
+    """Figure 20: no damping of its own, 4.1 % with control."""
+    outcome = simulate(Plan("bc-us-separation", gain_mw_per_mhz=12, duration_s=27))
+    assert outcome.mode is not None and outcome.open_loop is not None
+    assert outcome.open_loop.damping_percent == pytest.approx(0.0, abs=0.01)
+    assert outcome.mode.damping_percent == pytest.approx(4.1, abs=0.1)
+
+
+def test_five_modes_keep_table_2() -> None:
+    outcome = simulate(Plan(plant="modal-five", gain_mw_per_mhz=12, duration_s=19))
+    assert outcome.mode is not None
+    assert outcome.mode.frequency_hz == pytest.approx(0.435, abs=1.5e-3)
+    assert outcome.mode.damping_percent == pytest.approx(11.3, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["cbj"], "no scenario 'cbj': one of cjb, "),
+        (["cjb", "--plant", "modul"], "no plant 'modul': one of modal, "),
+        (["cjb", "--fault", "stream-stp"], "no fault 'stream-stp'; did you mean 'stream-stop'?"),
+        (["cjb", "--impair", "nothing.ini"], "--impair nothing.ini: neither a file nor a ready profile"),
+        (["cjb", "--sweep", "gain=0:30"], "--sweep gain=0:30: write gain|delay|deadband|seed=FROM:TO:STEP"),
+        (["cjb", "--sweep", "gain=0:30:0"], "write gain"),
+        (["cjb", "--sweep", "gain=-3:30:3"], "write gain"),
+        (["cjb", "--sweep", "gain=0:nan:3"], "write gain"),
+        (["cjb", "--sweep", "noise=0:30:3"], "write gain"),
+        (["cjb", "--sweep", "seed=1:200:1", "--sweep", "gain=0:15:0.1"], "--sweep: more than 10000 runs"),
+        (["bc-us-separation", "--plant", "modal-five"], "plant 'modal-five' has no condition 'bc-us-separated'"),
+        (["cjb", "--impair", "typo.ini"], "--impair: no PMU is called N9; there are N1, N2"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("typo.ini").write_text("[stream N9]\nloss = 5%\n")
+    assert run(dcon(), ["simulate", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err and err.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: Capsys) -> None:
+    (tmp_path / "file").write_text("")
+    assert run(dcon(), ["simulate", "cjb", "--out", str(tmp_path / "file" / "x")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
