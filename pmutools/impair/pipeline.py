@@ -96,6 +96,11 @@ class Pipeline:
         """The operator's switch; a scheduled ``disable`` does not move it."""
         return self._enabled
 
+    @property
+    def holding(self) -> bool:
+        """Whether frames are held back that will come with later ones, or at the end."""
+        return bool(self._held or self._flushed or self._transmission.holding)
+
     def act(self, action: Action) -> bool:
         """Do ``enable``, ``disable`` or ``fault`` from the next frame on; False where it does not concern this stream.
 

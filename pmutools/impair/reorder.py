@@ -58,6 +58,10 @@ class Reordering:
         self._left = 0
         self._latest_ns = 0
 
+    @property
+    def holding(self) -> bool:
+        return self._held is not None
+
     def apply(self, leaving: Leaving) -> tuple[Leaving, ...]:
         """What may leave now, in order; the held frame comes with the last of those that overtook it."""
         outgoing, at = leaving

@@ -45,6 +45,11 @@ class Transmission:
             "slot": self._set_slot,
         }
 
+    @property
+    def holding(self) -> bool:
+        """Whether a frame waits for others to overtake it."""
+        return self._reordering is not None and self._reordering.holding
+
     def change(self, option: str, stages: Stages) -> tuple[Outgoing, ...]:
         """Put one option anew to work; gives what its old state held back."""
         flushed = self.flush() if option == "reorder" else ()
