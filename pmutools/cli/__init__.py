@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+import click
+
 from pmutools.cli.shell import LazyGroup, run
 
 COMMANDS = {
@@ -34,9 +36,15 @@ def main() -> None:
 
 def player() -> None:
     """``stream-player``: the paper's Advanced Stream Player, ``pmu play``."""
-    sys.exit(run(pmu(), ["play", *sys.argv[1:]], name="stream-player"))
+    sys.exit(_alone("play", "stream-player"))
 
 
 def reader() -> None:
     """``stream-reader``: the paper's StreamReader, ``pmu read``."""
-    sys.exit(run(pmu(), ["read", *sys.argv[1:]], name="stream-reader"))
+    sys.exit(_alone("read", "stream-reader"))
+
+
+def _alone(subcommand: str, name: str) -> int:
+    group = pmu()
+    command = group.get_command(click.Context(group), subcommand)
+    return run(command, sys.argv[1:], name=name)

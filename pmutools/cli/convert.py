@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import click
 
@@ -29,7 +28,7 @@ def command(
     idcodes: tuple[str, ...],
     phasors: str,
     long_form: bool,
-    duration: float | None,
+    duration_ns: int | None,
     as_json: bool,
     quiet: bool,
     verbose: int,
@@ -38,28 +37,28 @@ def command(
 
     Frames go to frames byte for byte; tables hold SI units and keep the configuration where the format can.
     """
-    from pmutools.formats import open_sink, open_source
+    from pmutools.formats import open_sink
     from pmutools.tools.convert import convert
+    from pmutools.tools.recordings import open_recordings
     from pmutools.tools.window import Window, parse_moment
 
     talk = Talk(quiet, verbose)
     window = Window(
         parse_moment(start) if start else None,
         parse_moment(end) if end else None,
-        None if duration is None else round(duration * 1e9),
+        duration_ns,
         parse_idcodes(idcodes),
     )
-    sources = [open_source(path) for path in inputs]
+    source = open_recordings(inputs)
     with open_sink(output, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
-        result = convert(sources, sink, window)
-    paths = ", ".join(str(path) for path in sink.paths)
-    if as_json:
-        json.dump(result.to_json() | {"paths": [str(path) for path in sink.paths]}, sys.stdout)
-        sys.stdout.write("\n")
-    talk.say(f"{result.frames} data frames of {result.streams} streams -> {paths or output}")
+        result = convert(source, sink, window)
+    paths = [str(path) for path in sink.paths]
+    if as_json and output != "-":
+        click.echo(json.dumps(result.to_json() | {"paths": paths}))
+    if not result.frames:
+        talk.complain(f"pmu convert: no data frames in {', '.join(inputs)} within what was asked for")
+        return Exit.FAILED
+    talk.say(f"{result.frames} data frames of {result.streams} streams -> {', '.join(paths)}")
     for name, count in result.losses.items():
         talk.say(f"  {name}: {count}")
-    if not result.frames:
-        click.echo(f"pmu convert: no data frames in {', '.join(inputs)} within what was asked for", err=True)
-        return Exit.FAILED
     return Exit.INCOMPLETE if result.losses else Exit.DONE

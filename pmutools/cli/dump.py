@@ -19,7 +19,7 @@ TYPES = ("data", "cfg1", "cfg2", "cfg3", "header", "command", "skipped")
 @DURATION
 @common
 def command(
-    target: str, types: tuple[str, ...], duration: float | None, as_json: bool, quiet: bool, verbose: int
+    target: str, types: tuple[str, ...], duration_ns: int | None, as_json: bool, quiet: bool, verbose: int
 ) -> int:
     """Every frame of a FILE or live URL, one a line.
 
@@ -31,20 +31,22 @@ def command(
     from pmutools.tools.describe import describe, one_line
 
     talk = Talk(quiet, verbose)
-    skipped = shown = 0
+    skipped = frames = 0
     out: IO[str] = sys.stdout
-    with open_target(target, duration) as source:
+    with open_target(target, duration_ns) as source:
         for item in source.items():
-            skipped += item.skipped.nbytes if isinstance(item, Loss) else 0
+            if isinstance(item, Loss):
+                skipped += item.skipped.nbytes
+            else:
+                frames += 1
             described = describe(item)
-            if types and described["type"] not in types:
-                continue
-            shown += 1
-            out.write((json.dumps(described, separators=(",", ":")) if as_json else one_line(described)) + "\n")
+            if not types or described["type"] in types:
+                line = json.dumps(described, separators=(",", ":")) if as_json else one_line(described)
+                out.write(f"{line}\n")
         defects = source.defects()
     for name, count in defects.items():
         talk.say(f"{target}: {name}: {count}")
-    if not shown and not skipped:
-        talk.say(f"{target}: no C37.118 frames found" + (f" of type {', '.join(types)}" if types else ""))
-        return Exit.DONE if types else Exit.FAILED
+    if not frames and not skipped:
+        talk.complain(f"pmu dump: {target}: no C37.118 frames found")
+        return Exit.FAILED
     return Exit.INCOMPLETE if skipped or defects else Exit.DONE

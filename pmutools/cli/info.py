@@ -8,13 +8,17 @@ import click
 
 from pmutools.cli.shell import Exit, Talk, common
 from pmutools.cli.sources import DURATION, TARGET, open_target
+from pmutools.timebase import NS
+
+LIVE_NS = 5 * NS
+"""How long a live stream is looked at."""
 
 
 @click.command(name="info", short_help="What a recording or a live stream holds, and what is wrong with it.")
 @click.argument("target", type=TARGET)
 @DURATION
 @common
-def command(target: str, duration: float | None, as_json: bool, quiet: bool, verbose: int) -> int:
+def command(target: str, duration_ns: int | None, as_json: bool, quiet: bool, verbose: int) -> int:
     """Streams, stations, channels, rate, span, gaps and defects of a FILE or live URL.
 
     A URL is read for --duration seconds (5 by default). Exit code 3 says that some bytes were lost or undecodable.
@@ -23,12 +27,14 @@ def command(target: str, duration: float | None, as_json: bool, quiet: bool, ver
 
     from pmutools.tools.inventory import take_inventory
 
-    Talk(quiet, verbose)
-    with open_target(target, duration if duration is not None or "://" not in target else 5.0) as source:
+    talk = Talk(quiet, verbose)
+    if duration_ns is None and "://" in target:
+        duration_ns = LIVE_NS
+    with open_target(target, duration_ns) as source:
         inventory = take_inventory(source)
     if not inventory.frames:
-        click.echo(f"pmu info: {target}: no C37.118 frames found in {inventory.bytes_in} bytes of payload", err=True)
-        return Exit.FAILED
+        talk.complain(f"pmu info: {target}: no C37.118 frames found in {inventory.bytes_in} bytes of payload")
+        return Exit.INCOMPLETE if inventory.skipped else Exit.FAILED
     if as_json:
         json.dump(inventory.to_json(), sys.stdout, indent=2)
         sys.stdout.write("\n")

@@ -5,23 +5,32 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
+from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from pmutools.cli.shell import F, Talk, common
+from pmutools import parsers
+from pmutools.cli.shell import Exit, F, Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION
 from pmutools.errors import SettingsError
 
 if TYPE_CHECKING:
     from pmutools.impair.profile import Profile
+    from pmutools.tools.player.play import StreamResult
 
+MS = 1_000_000
 FAULTS = ("loss", "delay", "drop", "duplicate", "reorder", "corrupt", "disable")
 
 
 def _fault(name: str, metavar: str, text: str) -> Callable[[F], F]:
     return click.option(f"--{name}", f"fault_{name}", multiple=True, metavar=metavar, help=text)
+
+
+def _speed(text: str) -> Fraction:
+    parsers.number(0.001, 1000)(text)
+    return Fraction(text.strip())
 
 
 @click.command(name="play", short_help="Stream a recording live, as any number of PMUs.")
@@ -30,16 +39,24 @@ def _fault(name: str, metavar: str, text: str) -> Callable[[F], F]:
 @click.option("--listen", multiple=True, metavar="URL", help="Serve at tcp://, udp+cmd:// or tcp+udp://; repeatable.")
 @click.option("--stamp", type=click.Choice(("shift", "keep", "now-grid", "now")), default="shift", show_default=True)
 @click.option("--timing", type=click.Choice(("stamp", "arrival")), help="Default: arrival where recorded, else stamp.")
-@click.option("--speed", type=click.FloatRange(0, 1000, min_open=True), default=1.0, show_default=True, metavar="X")
-@click.option("--fps", type=click.IntRange(1, 1000), metavar="N", help="New stamps and DATA_RATE.")
-@click.option("--interval", type=click.FloatRange(0, min_open=True), metavar="MS", help="Send spacing only.")
+@click.option("--speed", type=Parsed(_speed), default="1", show_default=True, metavar="X")
+@click.option("--fps", type=Parsed(parsers.integer(1, 1000)), metavar="N", help="New stamps and DATA_RATE.")
+@click.option(
+    "--interval", "interval_ns", type=Parsed(parsers.duration_ns(MS, 0.001)), metavar="MS", help="Send spacing only."
+)
 @click.option("--loop", "loops", type=click.IntRange(0), default=1, show_default=True, help="0: for ever.")
 @click.option("--start", metavar="T", help="From T: seconds into the source, or UTC.")
 @click.option("--end", metavar="T", help="Up to T, exclusive.")
 @click.option("--select", multiple=True, metavar="NAME|IDCODE", help="Only this stream; repeatable.")
 @click.option("--exclude", multiple=True, metavar="NAME|IDCODE", help="Not this stream; repeatable.")
 @click.option(
-    "--cfg-period", type=click.FloatRange(0), default=60.0, show_default=True, metavar="S", help="0: at start."
+    "--cfg-period",
+    "cfg_period_ns",
+    type=Parsed(parsers.seconds_ns),
+    default="60",
+    show_default=True,
+    metavar="S",
+    help="0: at start.",
 )
 @click.option("--impair", metavar="PROFILE", help="Impairment profile: a ready one's name, or a file.")
 @_fault("loss", "P%", "Lose frames at random, or by a model: gemodel(1%,20%).")
@@ -49,7 +66,7 @@ def _fault(name: str, metavar: str, text: str) -> Callable[[F], F]:
 @_fault("reorder", "P%", "Let frames overtake.")
 @_fault("corrupt", "P%", "Damage frames.")
 @_fault("disable", "NAME@T1..T2", "Switch a stream off from T1 to T2 s of stream time.")
-@click.option("--seed", type=int, metavar="N", help="Same seed, same faults.")
+@click.option("--seed", type=Parsed(parsers.integer(0, 2**64 - 1)), metavar="N", help="Same seed, same faults.")
 @click.option("--ledger", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.parquet")
 @DURATION
 @common
@@ -59,82 +76,96 @@ def command(
     listen: tuple[str, ...],
     stamp: str,
     timing: str | None,
-    speed: float,
+    speed: Fraction,
     fps: int | None,
-    interval: float | None,
+    interval_ns: int | None,
     loops: int,
     start: str | None,
     end: str | None,
     select: tuple[str, ...],
     exclude: tuple[str, ...],
-    cfg_period: float,
+    cfg_period_ns: int,
     impair: str | None,
     seed: int | None,
     ledger: Path | None,
-    duration: float | None,
+    duration_ns: int | None,
     as_json: bool,
     quiet: bool,
     verbose: int,
     **faults: tuple[str, ...],
-) -> None:
+) -> int:
     """Play recordings live: every stream as a PMU of its own, restamped, on absolute deadlines.
 
     With --listen alone, playing begins at the first start command. --duration ends it S seconds after it began to
     listen or send. At the end each stream's pacing error is told: that is the player's accuracy.
     """
-    from fractions import Fraction
-
     from pmutools.clock import SystemClock
     from pmutools.net.endpoint import parse_endpoint
-    from pmutools.tools.convert import merged
     from pmutools.tools.player.ledger import LedgerWriter
     from pmutools.tools.player.play import Options, Player
     from pmutools.tools.player.script import study
     from pmutools.tools.player.stamps import StampPolicy
+    from pmutools.tools.recordings import losses, open_recordings
     from pmutools.tools.window import Window, parse_moment
 
     talk = Talk(quiet, verbose)
     if not to and not listen:
         raise SettingsError("where to? give --to udp://HOST:PORT or --listen tcp://HOST:PORT")
-    if fps is not None and interval is not None:
+    if fps is not None and interval_ns is not None:
         raise SettingsError("--fps and --interval clash: the first changes the stamps too, the second the spacing only")
+    if fps is not None and stamp == StampPolicy.KEEP:
+        raise SettingsError("--fps makes new stamps, --stamp keep keeps the old: leave one out")
     options = Options(
         to=[parse_endpoint(url) for url in to],
         listen=[parse_endpoint(url) for url in listen],
         policy=StampPolicy(stamp),
-        speed=Fraction(speed).limit_denominator(1_000_000),
-        interval_ns=None if interval is None else round(interval * 1e6),
+        speed=speed,
+        interval_ns=interval_ns,
         fps=fps,
         loops=loops,
-        cfg_period_s=cfg_period,
+        cfg_period_ns=cfg_period_ns,
         profile=_profile(impair, faults),
         seed=seed,
-        duration_s=duration,
+        duration_ns=duration_ns,
     )
-    first, last = parse_moment(start) if start else None, parse_moment(end) if end else None
-
-    def items() -> Any:
-        return Window(first, last).items(merged(files))
-
-    script = study(items, timing, select, exclude)
-    player = Player(script, items, options, SystemClock(spin_ns=100_000))
-    for url in (*to, *listen):
-        talk.say(f"{len(script.streams)} streams, {sum(s.frames for s in script.streams)} data frames: {url}")
-    try:
+    window = Window(parse_moment(start) if start else None, parse_moment(end) if end else None)
+    source = open_recordings(files)
+    script = study(source.items(), timing, window, select, exclude)
+    lost = losses(source)
+    for pattern in options.profile.unmatched(stream.names for stream in script.streams):
+        talk.say(f"no stream is called {pattern!r}; there are {', '.join(stream.name for stream in script.streams)}")
+    with (
+        interruptible() as stop,
+        Player(
+            script,
+            lambda: open_recordings(files).items(),
+            options,
+            SystemClock(spin_ns=100_000),
+            stop=stop,
+            tell=lambda event: talk.say(f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip()),
+        ) as player,
+    ):
+        for url in (*to, *listen):
+            talk.say(f"{len(script.streams)} streams, {sum(s.frames for s in script.streams)} data frames: {url}")
         with LedgerWriter(ledger) if ledger is not None else nullcontext() as rows:
-            results = player.play(rows, lambda event: talk.say(f"{event.client} {event.kind} {event.idcode or ''}"))
-    finally:
-        player.close()
+            player.play(rows)
+        stopped = stop()
     if as_json:
-        click.echo(json.dumps({"streams": [result.to_json() for result in results]}))
-    for result in results:
-        described = result.to_json()
-        fates = ", ".join(f"{count} {fate}" for fate, count in described["fates"].items()) or "nothing due"
-        late = described["late_us"]
-        talk.say(
-            f"  {result.name:<16} {fates}; late p50 {late['p50']:.0f} us, p99 {late['p99']:.0f} us, "
-            f"max {late['max']:.0f} us, {described['misses']} misses"
-        )
+        click.echo(json.dumps({"streams": [result.to_json() for result in player.results], "losses": lost}))
+    for result in player.results:
+        talk.say(_told(result))
+    for name, count in lost.items():
+        talk.say(f"  {name}: {count}")
+    if stopped:
+        return Exit.INTERRUPTED
+    return Exit.INCOMPLETE if lost else Exit.DONE
+
+
+def _told(result: StreamResult) -> str:
+    fates = ", ".join(f"{count} {fate}" for fate, count in result.fates.items()) or "nothing due"
+    late = result.lateness.summary()
+    p50, p99, most = (f"{ns / 1000:.0f} us" for ns in (late.p50_ns, late.p99_ns, late.max_ns))
+    return f"  {result.name:<16} {fates}; late p50 {p50}, p99 {p99}, max {most}, {late.misses} misses"
 
 
 def _profile(impair: str | None, faults: dict[str, tuple[str, ...]]) -> Profile:

@@ -6,7 +6,7 @@ import json
 
 import click
 
-from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.shell import Exit, Talk, common, interruptible
 from pmutools.cli.sources import DURATION
 
 
@@ -22,7 +22,7 @@ def command(
     out: str,
     phasors: str,
     long_form: bool,
-    duration: float | None,
+    duration_ns: int | None,
     as_json: bool,
     quiet: bool,
     verbose: int,
@@ -44,21 +44,23 @@ def command(
             detail = event.detail.removeprefix(f"{event.where}: ")
             talk.say(f"{event.where}: {event.kind}" + (f": {detail}" if detail else ""))
 
-    with LiveSource(urls, duration_s=duration, tell=tell) as source:  # bound before anything slow is imported
-        from pmutools.formats import open_sink
-        from pmutools.tools.reader import Reading, read
+    with interruptible() as stop, LiveSource(urls, duration_ns=duration_ns, tell=tell, stop=stop) as source:
+        from pmutools.formats import open_sink  # slow to import: the sockets are bound by now
+        from pmutools.tools.reader import read
 
-        reading: Reading | None = None
         with open_sink(out, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
             reading = read(source, sink, lambda now: talk.progress(f"{now.frames} frames, {len(now.streams)} streams"))
+        stopped = stop()
     paths = [str(path) for path in sink.paths]
     if as_json and out != "-":
         click.echo(json.dumps(reading.to_json() | {"paths": paths}))
-    talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {', '.join(paths)}")
+    talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {', '.join(paths) or 'nothing written'}")
     for reason, nbytes in reading.tally.skipped.items():
         talk.say(f"  {nbytes} bytes skipped: {reason}")
     if reading.own_drops:
         talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
+    if stopped:
+        return Exit.INTERRUPTED
     if not reading.frames and not reading.tally.skipped:
         raise SourceError(f"no data came from {', '.join(urls)}; is the sender on, and the port and IDCODE right?")
     return Exit.INCOMPLETE if reading.tally.skipped or reading.own_drops else Exit.DONE

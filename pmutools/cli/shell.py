@@ -6,11 +6,14 @@ Exit codes: 0 done; 1 failed; 2 usage; 3 finished, but input was lost or undecod
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
 from importlib import import_module
 from types import FrameType
@@ -19,6 +22,7 @@ from typing import Any, TypeVar
 import click
 
 from pmutools.errors import PmuError, SettingsError
+from pmutools.parsers import Parser, suggestion
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -42,9 +46,9 @@ class LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.lazy)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         if cmd_name not in self.lazy:
-            return None
+            raise click.UsageError(f"no command {cmd_name!r}; {suggestion(cmd_name, self.lazy)}", ctx)
         command: click.Command = import_module(self.lazy[cmd_name][0]).command
         return command
 
@@ -78,8 +82,12 @@ class Talk:
 
     def say(self, text: str) -> None:
         if not self.quiet:
-            self._clear()
-            click.echo(text, err=True)
+            self.complain(text)
+
+    def complain(self, text: str) -> None:
+        """Say what went wrong: shown with ``--quiet`` too."""
+        self._clear()
+        click.echo(text, err=True)
 
     def progress(self, text: str) -> None:
         """A line that the next one overwrites; only where a person is watching."""
@@ -94,43 +102,96 @@ class Talk:
             self._shown = False
 
 
+class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4, of the same name before
+    """An option read by one of :mod:`pmutools.parsers`, which says what is wrong with a value and what to write."""
+
+    name = "value"
+
+    def __init__(self, parse: Parser[Any]) -> None:
+        self.parse = parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.parse(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM only ask to stop: gives a function that tells whether they have; a second one interrupts.
+
+    For work that must not be cut between two writes. Who uses this returns :attr:`Exit.INTERRUPTED`.
+    """
+    asked = False
+
+    def ask(signum: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run(command: click.Command, arguments: Sequence[str], *, name: str | None = None) -> int:
-    """Run a command; every outcome becomes an exit code and at most one line on stderr."""
+    """Run a command; every outcome becomes an exit code and at most one line on stderr.
+
+    ``--debug`` adds the traceback, and changes nothing else.
+    """
     name = name or command.name or "pmu"
-    debug = "--debug" in arguments
     signal.signal(signal.SIGTERM, _interrupt)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a station's name is no reason to fail
     try:
         code = command.main(list(arguments), prog_name=name, standalone_mode=False)
         sys.stdout.flush()
         return int(code or 0)
-    except click.ClickException as error:
-        if debug:
-            raise
-        error.show()
-        return Exit.USAGE
     except (KeyboardInterrupt, click.Abort):
         return Exit.INTERRUPTED
     except BrokenPipeError:  # `pmu dump ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return Exit.DONE
-    except SettingsError as error:
-        if debug:
-            raise
-        return _complain(name, error, Exit.USAGE)
-    except (PmuError, OSError) as error:
-        if debug:
-            raise
-        return _complain(name, error, Exit.FAILED)
     except Exception as error:
-        if debug:
-            raise
-        return _complain(name, f"internal error: {type(error).__name__}: {error} (--debug shows where)", Exit.FAILED)
+        if "--debug" in arguments:
+            traceback.print_exc()
+        code, text = _judged(error, name)
+        click.echo(text, err=True)
+        return code
 
 
-def _complain(name: str, error: object, code: Exit) -> int:
-    text = " ".join(str(error).split())
-    click.echo(f"{name}: {text}", err=True)
-    return code
+def _judged(error: Exception, name: str) -> tuple[Exit, str]:
+    """The exit code and the text of an error: one line, but for the help that a bare ``pmu`` gives."""
+    match error:
+        case click.UsageError(ctx=click.Context() as ctx) if error.message == ctx.get_help():
+            return Exit.USAGE, error.message
+        case click.UsageError(ctx=click.Context() as ctx):
+            return (
+                Exit.USAGE,
+                f"{_line(ctx.command_path, error.format_message())} ({ctx.command_path} --help lists all)",
+            )
+        case click.ClickException():
+            return Exit.USAGE, _line(name, error.format_message())
+        case SettingsError():
+            return Exit.USAGE, _line(name, error)
+        case PmuError():
+            return Exit.FAILED, _line(name, error)
+        case OSError():
+            return Exit.FAILED, _line(name, f"{error.filename}: {error.strerror}" if error.filename else error)
+    what = f"internal error: {type(error).__name__}: {error} (--debug shows where)"
+    return Exit.FAILED, _line(name, what)
+
+
+def _line(name: str, what: object) -> str:
+    return f"{name}: {' '.join(str(what).split())}"
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

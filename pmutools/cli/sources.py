@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmutools import parsers
+from pmutools.cli.shell import Parsed
 from pmutools.errors import SettingsError
+from pmutools.timebase import NS
 
 if TYPE_CHECKING:
     from pmutools.c37118.demux import Loss, Message
@@ -17,42 +20,35 @@ if TYPE_CHECKING:
 TARGET = str
 """A path, or an endpoint URL."""
 
-
-def _seconds(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    if value is not None and not 0 < value < 1e9:
-        raise click.BadParameter("must be a number of seconds above 0", ctx, param)
-    return value
-
-
 DURATION = click.option(
     "--duration",
-    type=float,
-    callback=_seconds,
+    "duration_ns",
+    type=Parsed(parsers.duration_ns(NS, 0.001)),
     metavar="S",
     help="Stop after S seconds: wall time for a live stream, stream time for a file.",
 )
 
 
 @contextmanager
-def open_target(target: str, duration: float | None) -> Iterator[Source]:
-    """A file's source, cut to ``duration`` seconds of stream time, or a live one that ends after that wall time."""
+def open_target(target: str, duration_ns: int | None) -> Iterator[Source]:
+    """A file's source, cut to ``duration_ns`` of stream time, or a live one that ends after that wall time."""
     if "://" in target:
         from pmutools.tools.live import LiveSource
 
-        with LiveSource([target], duration_s=duration) as live:
+        with LiveSource([target], duration_ns=duration_ns) as live:
             yield live
         return
     from pmutools.formats import open_source
 
     source = open_source(target)
-    yield source if duration is None else _Cut(source, duration)
+    yield source if duration_ns is None else _Cut(source, duration_ns)
 
 
 class _Cut:
-    """A source whose data frames end ``duration`` seconds after the first."""
+    """A source whose data frames end ``duration_ns`` after the first."""
 
-    def __init__(self, source: Source, duration: float) -> None:
-        self._source, self._duration_ns = source, round(duration * 1e9)
+    def __init__(self, source: Source, duration_ns: int) -> None:
+        self._source, self._duration_ns = source, duration_ns
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._source, name)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import click
 
-from pmutools.cli.shell import Talk, common
+from pmutools import parsers
+from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SettingsError
 
 
@@ -15,9 +16,9 @@ from pmutools.errors import SettingsError
 @click.option("--pmus", type=click.IntRange(1, 200), default=8, show_default=True, help="Half north, half south.")
 @click.option("--rate", type=click.IntRange(1, 240), default=60, show_default=True, metavar="FPS")
 @click.option(
-    "--duration", type=click.FloatRange(0, 86400, min_open=True), metavar="S", help="Default: the scenario's."
+    "--duration", type=Parsed(parsers.number(0.001, 86400)), metavar="S", help="Default: the scenario's, at most a day."
 )
-@click.option("--seed", type=int, default=1, show_default=True, metavar="N")
+@click.option("--seed", type=Parsed(parsers.integer(0, 2**64 - 1)), default="1", show_default=True, metavar="N")
 @click.option(
     "--pdc", type=click.IntRange(1, 65534), metavar="IDCODE", help="All PMUs in one stream of a concentrator."
 )
@@ -50,7 +51,7 @@ def command(
         raise SettingsError("--pdc: at most 100 PMUs in one stream")
     messages = synthesise(Recipe(scenario_name, plant, pmus, rate, duration, seed, pdc))
     with open_sink(output) as sink:
-        result = convert([MessageSource(Path(scenario_name), "synth", messages)], sink, Window())
+        result = convert(MessageSource(Path(scenario_name), "synth", messages), sink, Window())
     paths = [str(path) for path in sink.paths]
     if as_json:
         click.echo(json.dumps(result.to_json() | {"paths": paths}))

@@ -22,8 +22,9 @@ POLL_NS = 100_000_000
 class LiveSource:
     """Endpoints as a source: bound when made, read by iterating, closed by leaving the ``with``.
 
-    ``tell`` is given the news of connections. Iteration ends ``duration_s`` after the source was made, or never.
-    Raises SourceError where an endpoint cannot be opened, SettingsError for a URL that is none.
+    ``tell`` is given the news of connections. Iteration ends ``duration_ns`` after the source was made, or when
+    ``stop``, asked every 0.1 s, says so. Raises SourceError where an endpoint cannot be opened, SettingsError for a
+    URL that is none.
     """
 
     kind = "live"
@@ -32,9 +33,10 @@ class LiveSource:
         self,
         urls: Sequence[str | Endpoint],
         *,
-        duration_s: float | None = None,
+        duration_ns: int | None = None,
         configs: Iterable[StreamConfig] = (),
         tell: Callable[[LinkEvent], None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
         clock: Clock | None = None,
     ) -> None:
         endpoints = [parse_endpoint(url) if isinstance(url, str) else url for url in urls]
@@ -44,9 +46,9 @@ class LiveSource:
         self.tally = self.receivers.demux.tally
         self.own_drops = 0
         """Datagrams lost in this machine's receive buffers: not the network's doing."""
-        self._tell = tell
+        self._tell, self._stop = tell, stop
         started_ns = self.clock.monotonic_ns()
-        self._end_ns = None if duration_s is None else started_ns + round(duration_s * 1e9)
+        self._end_ns = None if duration_ns is None else started_ns + duration_ns
 
     def __enter__(self) -> LiveSource:
         return self
@@ -58,7 +60,7 @@ class LiveSource:
 
     def polls(self) -> Iterator[list[Message | Loss]]:
         """What came, poll by poll, an empty list at least every 0.1 s; the last one holds what was pending."""
-        while (left_ns := self._left_ns()) > 0:
+        while (left_ns := self._left_ns()) > 0 and not self._stop():
             found: list[Message | Loss] = []
             for item in self.receivers.poll(min(POLL_NS, left_ns)):
                 if not isinstance(item, Chunk):

@@ -8,11 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmutools import timebase
+from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
 from pmutools.c37118.prefix import decode_prefix
 from pmutools.errors import SettingsError
 from pmutools.formats.source import Block
+
+FOREVER = 1 << 62
+"""Further from 1970 than any stamp, in ns."""
+
+
+def stamp_of(frame: bytes, config: StreamConfig) -> int:
+    """Time of measurement of a data frame, POSIX UTC ns."""
+    prefix = decode_prefix(frame)
+    return timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +34,7 @@ class Moment:
 
     def resolve(self, first_ns: int) -> int:
         """POSIX UTC ns, given the source's first stamp."""
-        return first_ns + self.ns if self.relative else self.ns
+        return max(-FOREVER, min(first_ns + self.ns if self.relative else self.ns, FOREVER))
 
 
 def parse_moment(text: str) -> Moment:
@@ -45,8 +55,9 @@ def parse_moment(text: str) -> Moment:
 class Window:
     """Keeps data frames with ``start <= time < end`` and, if ``idcodes`` are named, only their streams.
 
-    ``duration_ns`` counts from the first stamp kept. Configurations, headers and commands pass whatever their time.
-    One window reads one source: it learns the first stamp from what it is shown.
+    Relative times count from the first data frame of the source, ``duration_ns`` from there or from ``start`` if that
+    is later. Configurations, headers and commands pass whatever their time. One window reads one source: it learns the
+    first stamp from what it is shown.
     """
 
     start: Moment | None = None
@@ -61,21 +72,26 @@ class Window:
         """Whether everything passes."""
         return self.start is None and self.end is None and self.duration_ns is None and not self.idcodes
 
+    def bounds(self, time_ns: int) -> tuple[int, int]:
+        """POSIX UTC ns of the first stamp that is kept and of the first that is not any more.
+
+        ``time_ns`` is the stamp of the frame at hand; that of the first call is the source's first.
+        """
+        if self._low is None or self._high is None:
+            self._low = self.start.resolve(time_ns) if self.start else -FOREVER
+            self._high = self.end.resolve(time_ns) if self.end else FOREVER
+            if self.duration_ns is not None:
+                self._high = min(self._high, max(self._low, time_ns) + self.duration_ns, FOREVER)
+        return self._low, self._high
+
     def items(self, items: Iterable[Message | Loss]) -> Iterator[Message | Loss]:
         """Messages in the window; losses pass."""
         if self.open:
             yield from items
             return
         for item in items:
-            if isinstance(item, Message):
-                if self.idcodes and item.frame.idcode not in self.idcodes:
-                    continue
-                if item.frame.type is FrameType.DATA and item.config is not None:
-                    prefix = decode_prefix(item.frame.data)
-                    time_ns = timebase.to_ns(prefix.soc, prefix.fracsec, item.config.time_base)
-                    low, high = self._bounds(time_ns)
-                    if not low <= time_ns < high:
-                        continue
+            if isinstance(item, Message) and not self._keeps(item):
+                continue
             yield item
 
     def blocks(self, blocks: Iterable[Block | Message | Loss]) -> Iterator[Block | Message | Loss]:
@@ -84,27 +100,28 @@ class Window:
             yield from blocks
             return
         for item in blocks:
-            if isinstance(item, Loss):
+            if isinstance(item, Block):
+                yield from self._cut(item)
+            elif isinstance(item, Loss) or self._keeps(item):
                 yield item
-            elif isinstance(item, Message):
-                if not self.idcodes or item.frame.idcode in self.idcodes:
-                    yield item
-            elif not self.idcodes or item.batch.config.idcode in self.idcodes:
-                times = item.batch.time_ns
-                low, high = self._bounds(int(times[0]))
-                inside = (times >= low) & (times < high)
-                if inside.all():
-                    yield item
-                elif inside.any():
-                    for run in np.split(
-                        np.flatnonzero(inside), np.flatnonzero(np.diff(np.flatnonzero(inside)) > 1) + 1
-                    ):
-                        yield Block(item.flow, item.batch[int(run[0]) : int(run[-1]) + 1])
 
-    def _bounds(self, time_ns: int) -> tuple[float, float]:
-        if self._low is None or self._high is None:
-            self._low = self.start.resolve(time_ns) if self.start else -(1 << 62)
-            self._high = self.end.resolve(time_ns) if self.end else 1 << 62
-            if self.duration_ns is not None:
-                self._high = min(self._high, max(self._low, time_ns) + self.duration_ns)
-        return self._low, self._high
+    def _keeps(self, message: Message) -> bool:
+        frame, _, config = message
+        inside = True
+        if frame.type is FrameType.DATA and config is not None:
+            time_ns = stamp_of(frame.data, config)
+            low, high = self.bounds(time_ns)
+            inside = low <= time_ns < high
+        return inside and (not self.idcodes or frame.idcode in self.idcodes)
+
+    def _cut(self, block: Block) -> Iterator[Block]:
+        flow, batch = block
+        low, high = self.bounds(int(batch.time_ns[0]))
+        if self.idcodes and batch.config.idcode not in self.idcodes:
+            return
+        rows = np.flatnonzero((batch.time_ns >= low) & (batch.time_ns < high))
+        if len(rows) == len(batch):
+            yield block
+        elif len(rows):
+            for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+                yield Block(flow, batch[int(run[0]) : int(run[-1]) + 1])

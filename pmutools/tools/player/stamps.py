@@ -19,6 +19,9 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.frames import restamp
 from pmutools.tools.player.script import Cue, Script
 
+NEAR = Fraction(1, 10)
+"""Recorded stamps are rounded: one this share of a period after a reporting instant is taken for on it."""
+
 
 class StampPolicy(StrEnum):
     SHIFT = "shift"
@@ -32,8 +35,7 @@ class Timeline:
     """When each cue is sent and what stamp it gets.
 
     ``start_utc_ns`` is the UTC time of offset 0; ``shift_ns``, whole seconds, takes recorded stamps there. ``speed``,
-    ``interval_ns`` (send spacing of each stream's frames) and ``fps`` (new stamps and DATA_RATE) are the
-    options'.
+    ``interval_ns`` (send spacing of each stream's frames) and ``fps`` (new stamps and DATA_RATE) are the options'.
     """
 
     script: Script
@@ -44,12 +46,19 @@ class Timeline:
     interval_ns: int | None = None
     fps: int | None = None
 
+    @property
+    def by_index(self) -> bool:
+        """Whether frames are due by their number in the stream, not by their stamp."""
+        return self.interval_ns is not None or self.fps is not None
+
     def stream_ns(self, cue: Cue, loop: int) -> int:
         """Stream time at which a cue of the ``loop``-th round is due: ns from the start, at speed 1."""
+        stream = self.script.streams[cue.stream]
         if self.interval_ns is not None:
-            return self._index(cue, loop) * self.interval_ns
+            first_ns = stream.first_due_ns - self.script.first_due_ns
+            return first_ns + (cue.place + loop * stream.frames) * self.interval_ns
         if self.fps is not None:
-            return self._resampled_ns(cue, loop)
+            return self._resampled_ns(cue, loop, self.fps) - self.start_utc_ns + cue.latency_ns
         return cue.due_ns + loop * self.script.loop_ns
 
     def offset_ns(self, stream_ns: int) -> int:
@@ -66,25 +75,26 @@ class Timeline:
             soc = int.from_bytes(data[6:10], "big") + shift_ns // timebase.NS
             fracsec = int.from_bytes(data[11:14], "big")
             return restamp(data, soc & 0xFFFFFFFF, fracsec), cue.stamp_ns + shift_ns
-        if self.policy is StampPolicy.SHIFT:
-            stamp_ns = self.script.first_stamp_ns + self.shift_ns + self._resampled_ns(cue, loop)
+        if self.policy is StampPolicy.SHIFT and self.fps is not None:
+            stamp_ns = self._resampled_ns(cue, loop, self.fps)
         else:
             stamp_ns = self.start_utc_ns + offset_ns
-            rate = Fraction(self.fps) if self.fps is not None else config.rate
+            rate = self.config(config).rate
             if self.policy is StampPolicy.NOW_GRID and rate:
                 stamp_ns = timebase.slot_time_ns(timebase.slot(stamp_ns, rate), rate)
-        return restamp(data, *timebase.from_ns(stamp_ns, config.time_base)), stamp_ns
+        soc, fracsec = timebase.from_ns(stamp_ns, config.time_base)
+        return restamp(data, soc & 0xFFFFFFFF, fracsec), stamp_ns
 
     def config(self, config: StreamConfig) -> StreamConfig:
         """The configuration that is announced: with another DATA_RATE if the rate is changed."""
         return config if self.fps is None else replace(config, data_rate=self.fps)
 
-    def _index(self, cue: Cue, loop: int) -> int:
-        return cue.number + loop * self.script.streams[cue.stream].frames
-
-    def _resampled_ns(self, cue: Cue, loop: int) -> int:
-        assert self.fps is not None
-        return self._index(cue, loop) * timebase.NS // self.fps
+    def _resampled_ns(self, cue: Cue, loop: int, fps: int) -> int:
+        """New stamps: a stream's frames at consecutive reporting instants, from the first one it may have."""
+        stream, rate = self.script.streams[cue.stream], Fraction(fps)
+        later = timebase.slot(stream.first_ns - self.script.first_ns, rate)
+        first = timebase.slot(self.start_utc_ns, rate) + later
+        return timebase.slot_time_ns(first + cue.place + loop * stream.frames, rate)
 
 
 def timeline(
@@ -96,11 +106,19 @@ def timeline(
     interval_ns: int | None = None,
     fps: int | None = None,
 ) -> Timeline:
-    """A timeline that begins at ``now_ns`` (POSIX UTC), or with ``shift`` at most a second later.
+    """A timeline that begins at ``now_ns`` (POSIX UTC), with ``shift`` at most a second later.
 
     With ``shift`` the first frame is due at its own new stamp (plus its recorded latency), so latency at the receiver
-    is what it was in the recording.
+    is what it was in the recording. ``now-grid`` and new stamps of another rate begin at a reporting instant.
     """
     shift_ns = -(-(now_ns - script.first_due_ns) // timebase.NS) * timebase.NS
-    start_ns = script.first_due_ns + shift_ns if policy is StampPolicy.SHIFT else now_ns
+    start_ns, rate, slack_ns = now_ns, Fraction(fps or 0), 0
+    if policy is StampPolicy.SHIFT:
+        start_ns = shift_ns + (script.first_ns if rate else script.first_due_ns)
+        slack_ns = round(NEAR * timebase.NS / rate) if rate else 0
+    elif policy is StampPolicy.NOW_GRID:
+        rate = rate or script.streams[0].config.rate
+    if rate:
+        index = -(-(start_ns - slack_ns) * rate.numerator // (rate.denominator * timebase.NS))
+        start_ns = timebase.slot_time_ns(index, rate)
     return Timeline(script, policy, start_ns, shift_ns, speed, interval_ns, fps)

@@ -1,0 +1,268 @@
+"""Recordings made of thin air and a player in virtual time: what it would send, when, exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from support.live import data_frame
+
+from pmutools.c37118 import (
+    Format,
+    Frame,
+    FrameType,
+    Message,
+    PhasorChannel,
+    Station,
+    StreamConfig,
+    decode_config,
+    decode_prefix,
+    encode_config,
+)
+from pmutools.c37118.session import Outcome, Served
+from pmutools.clock import VirtualClock
+from pmutools.flow import Flow, StampSource
+from pmutools.impair.profile import Profile, profile_of_options
+from pmutools.net.endpoint import Endpoint, parse_endpoint
+from pmutools.net.outlet import ServerEvent
+from pmutools.timebase import NS, from_ns, slot_time_ns, to_ns
+from pmutools.tools.player.ledger import LedgerWriter
+from pmutools.tools.player.play import Options, Player
+from pmutools.tools.player.script import Script, study
+from pmutools.tools.player.stamps import StampPolicy
+from pmutools.tools.window import Window
+
+START_NS = 1_473_354_311 * NS
+"""A whole second, 2016."""
+MS = 1_000_000
+NOWHERE = parse_endpoint("udp://192.0.2.99:4713")
+
+
+def stream(
+    idcode: int = 7, *, name: str | None = None, rate: int = 50, time_base: int = 1_000_000, cfgcnt: int = 0
+) -> StreamConfig:
+    """A one-station stream with one integer phasor."""
+    station = Station(name or f"PMU {idcode}", idcode, Format(0), (PhasorChannel("V1", 100),), cfgcnt=cfgcnt)
+    return StreamConfig(idcode, (station,), rate, time_base=time_base)
+
+
+def recording(
+    config: StreamConfig,
+    frames: int,
+    *,
+    first_ns: int = START_NS,
+    first_slot: int = 0,
+    latency_ns: Callable[[int], int] | int | None = None,
+    slots: Sequence[int] | None = None,
+    flow: Flow | None = None,
+    announced: bool = True,
+) -> list[Message]:
+    """A stream's CFG-2 and data frames; frame k (its deviation is k mHz) is stamped ``first_ns + slot / rate``.
+
+    ``latency_ns`` says how long after its stamp a frame arrived (None: nobody knows), ``slots`` which slot each has.
+    """
+    flow = flow or Flow("udp", f"192.0.2.{config.idcode % 250}:4713", "192.0.2.1:4713")
+    messages = []
+    if announced:
+        opening = encode_config(config, soc=first_ns // NS, fracsec=0)
+        arrival = None if latency_ns is None else first_ns
+        messages.append(Message(Frame(opening, arrival, StampSource.CAPTURE, 0), flow, config))
+    base_slot = first_ns * config.rate.numerator // (config.rate.denominator * NS)
+    for k in range(frames):
+        slot = first_slot + (slots[k] if slots is not None else k)
+        stamp_ns = slot_time_ns(base_slot + slot, config.rate)
+        data = data_frame(config, stamp_ns, value=k)
+        arrival = None
+        if latency_ns is not None:
+            arrival = stamp_ns + (latency_ns(k) if callable(latency_ns) else latency_ns)
+        messages.append(Message(Frame(data, arrival, StampSource.CAPTURE, 0), flow, config))
+    return messages
+
+
+def interleaved(*recordings: list[Message]) -> list[Message]:
+    """Recordings merged on their stamps, configurations first."""
+
+    def key(message: Message) -> tuple[bool, int]:
+        data = message.frame.type is FrameType.DATA
+        return data, stamp_ns(message.frame.data, message.config) if data else 0
+
+    return sorted((message for messages in recordings for message in messages), key=key)
+
+
+def stamp_ns(frame: bytes, config: StreamConfig | None) -> int:
+    prefix = decode_prefix(frame)
+    assert config is not None
+    return to_ns(prefix.soc, prefix.fracsec, config.time_base)
+
+
+def number(frame: bytes) -> int:
+    """Which frame of a :func:`recording` this is."""
+    return int.from_bytes(frame[-6:-4], "big", signed=True)
+
+
+class Sent(NamedTuple):
+    """A frame that left: on the virtual clock, from the start of play; its stream; its bytes."""
+
+    at_ns: int
+    stream: int
+    frame: bytes
+
+    @property
+    def type(self) -> FrameType:
+        return decode_prefix(self.frame).type
+
+
+@dataclass
+class Stage:
+    """Stands for :class:`~pmutools.net.server.Senders`: takes down what is published, and when.
+
+    ``plays`` maps times (ns from the making) to events that clients cause then; ``listeners`` are how many get a
+    stream's frames, ``refuses`` says for which frames (counted over all) how many of them fail.
+    """
+
+    clock: VirtualClock
+    plays: dict[int, ServerEvent] = field(default_factory=dict)
+    listeners: int = 1
+    refuses: dict[int, int] = field(default_factory=dict)
+    sent: list[Sent] = field(default_factory=list)
+    offered: list[Served] = field(default_factory=list)
+    announced: list[tuple[int, int]] = field(default_factory=list)
+    closed: bool = False
+    queued_bytes: int = 0
+    cost_ns: int = 0
+    """How long publishing takes."""
+
+    def __post_init__(self) -> None:
+        self.zero_ns = self.clock.monotonic_ns()
+        self._count = 0
+
+    def add(self, offer: Served) -> int:
+        self.offered.append(offer)
+        return len(self.offered) - 1
+
+    def replace(self, handle: int, offer: Served) -> None:
+        self.offered[handle] = offer
+
+    def send_to(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
+        return 0
+
+    def listen(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
+        return 0
+
+    def audience(self, handle: int) -> int:
+        return self.listeners
+
+    def announce(self, streams: Iterable[int] | None = None) -> None:
+        self.announced += [(self.now_ns, handle) for handle in streams or range(len(self.offered))]
+
+    def publish(self, frames: Iterable[tuple[int, bytes]]) -> list[int]:
+        failed = []
+        for mark, (handle, frame) in enumerate(frames):
+            self.sent.append(Sent(self.now_ns, handle, frame))
+            failed += [mark] * self.refuses.get(self._count, 0)
+            self._count += 1
+        self.clock.advance(self.cost_ns)
+        return failed
+
+    def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
+        return self.serve_until(self.clock.monotonic_ns() + (timeout_ns or 0))
+
+    def serve_until(self, deadline_ns: int) -> list[ServerEvent]:
+        due = sorted(at for at in self.plays if self.zero_ns + at <= deadline_ns)
+        self.clock.sleep_until(self.zero_ns + due[0] if due else deadline_ns)
+        return [self.plays.pop(due[0])] if due else []
+
+    def close(self) -> None:
+        self.closed = True
+
+    @property
+    def now_ns(self) -> int:
+        return self.clock.monotonic_ns() - self.zero_ns
+
+
+def started(idcode: int = 7) -> ServerEvent:
+    """News that a client has sent the start command."""
+    return ServerEvent(Outcome.STARTED, 0, "192.0.2.50:4712", idcode)
+
+
+@dataclass
+class Played:
+    """A run in virtual time that is over."""
+
+    script: Script
+    stage: Stage
+    player: Player
+    began_ns: int
+    """UTC when it began."""
+
+    @property
+    def data(self) -> list[Sent]:
+        return [sent for sent in self.stage.sent if sent.type is FrameType.DATA]
+
+    def times(self, stream: int = 0) -> list[int]:
+        """When the data frames of a stream left: ns from the beginning."""
+        return [sent.at_ns for sent in self.data if sent.stream == stream]
+
+    def stamps(self, stream: int = 0) -> list[int]:
+        """Stamps of the data frames sent, POSIX UTC ns."""
+        config = self.script.streams[stream].config
+        return [stamp_ns(sent.frame, config) for sent in self.data if sent.stream == stream]
+
+    def numbers(self, stream: int = 0) -> list[int]:
+        return [number(sent.frame) for sent in self.data if sent.stream == stream]
+
+    @property
+    def fates(self) -> dict[str, int]:
+        """Over all streams."""
+        total: dict[str, int] = {}
+        for result in self.player.results:
+            for fate, count in result.fates.items():
+                total[fate] = total.get(fate, 0) + count
+        return total
+
+
+def faults(*pairs: str) -> Profile:
+    """``faults("loss=5%", "drop=3")``, as on the command line."""
+    return profile_of_options((name, value) for name, _, value in (pair.partition("=") for pair in pairs))
+
+
+def play(
+    messages: list[Message],
+    *,
+    clock: VirtualClock | None = None,
+    stage: Stage | None = None,
+    window: Window | None = None,
+    timing: str | None = None,
+    select: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    ledger: Path | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> Played:
+    """Play ``messages`` to the end; ``options`` are those of :class:`Options`, ``policy`` and ``speed`` as text."""
+    clock = clock or VirtualClock()
+    stage = stage or Stage(clock)
+    script = study(messages, timing, window, select, exclude)
+    chosen = Options(**({"to": [NOWHERE]} | options))
+    chosen = replace(chosen, policy=StampPolicy(chosen.policy), speed=Fraction(chosen.speed))
+    began_ns = clock.realtime_ns()
+    with Player(script, lambda: messages, chosen, clock, stop=stop, senders=stage) as player:  # type: ignore[arg-type]
+        if ledger is None:
+            player.play()
+        else:
+            with LedgerWriter(ledger) as rows:
+                player.play(rows)
+    return Played(script, stage, player, began_ns)
+
+
+def config_of(sent: Sent) -> StreamConfig:
+    """A configuration frame that was sent."""
+    return decode_config(sent.frame)[1]
+
+
+def at(ns: int, config: StreamConfig) -> tuple[int, int]:
+    """(SOC, FRACSEC) of a time in a stream."""
+    return from_ns(ns, config.time_base)
