@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
+from types import FrameType
+from typing import TYPE_CHECKING
 
 import click
 
-from pmutools.cli.shell import Talk, common
+from pmutools.cli.shell import Exit, Talk, common
 from pmutools.errors import SettingsError
+
+if TYPE_CHECKING:
+    from dcon.platform.loop import Platform
 
 
 @click.command(name="platform", short_help="The real-time controller: PMU streams in, command out, session log.")
@@ -27,8 +35,10 @@ def command(
     as_json: bool,
     quiet: bool,
     verbose: int,
-) -> None:
+) -> int:
     """Run the controller: PMU streams in, 60 ticks a second, the command out over UDP, everything logged.
+
+    Ctrl-C ramps the command down, which takes a second, and ends; a second Ctrl-C ends at once.
 
     Research software. There is no watchdog and no operator link yet; orders are given beforehand with --order.
     """
@@ -45,7 +55,25 @@ def command(
     except ValueError as error:
         raise SettingsError(f"--start: {error}") from None
     path = log or settings.log.path
-    summary = Platform(settings).run(path, orders=timed, start_ns=start_ns, duration_s=duration)
+    platform = Platform(settings)
+    with _stopped_by_signals(platform):
+        summary = platform.run(path, orders=timed, start_ns=start_ns, duration_s=duration)
     if as_json:
         click.echo(json.dumps(asdict(summary)))
     talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}; session log {path}")
+    return Exit.INTERRUPTED if platform.stopping else Exit.DONE
+
+
+@contextmanager
+def _stopped_by_signals(platform: Platform) -> Iterator[None]:
+    def stop(signum: int, frame: FrameType | None) -> None:
+        if platform.stopping:
+            raise KeyboardInterrupt
+        platform.stop()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

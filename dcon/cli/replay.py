@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from pmutools.cli.shell import Exit, Talk, common
 from pmutools.errors import SourceError
+
+if TYPE_CHECKING:
+    from dcon.core.values import Record
+    from dcon.session.log import LoggedTick
+    from dcon.session.replay import Observer
 
 
 @click.command(name="replay", short_help="A recorded session through the engine again; commands must be identical.")
@@ -25,17 +33,8 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
     from dcon.session.replay import replay
 
     talk = Talk(quiet, verbose)
-    rows: list[str] = []
-    result = replay(
-        session,
-        changes,
-        None if out is None else lambda tick, now: rows.append(_row(tick.record.tick_ns, tick.record, now)),
-    )
-    if out is not None:
-        try:
-            out.write_text("tick_ns,recorded_command_mw,replayed_command_mw\n" + "".join(rows))
-        except OSError as error:
-            raise SourceError(f"--out {out}: {error.strerror}") from None
+    with _commands(out) as observe:
+        result = replay(session, changes, observe)
     if as_json:
         click.echo(json.dumps(result.to_json()))
     elif changes:
@@ -54,5 +53,21 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
     return Exit.INCOMPLETE if result.stopped or (result.different and not changes) else Exit.DONE
 
 
-def _row(tick_ns: int, recorded: object, replayed: object) -> str:
-    return f"{tick_ns},{recorded.command_mw!r},{replayed.command_mw!r}\n"  # type: ignore[attr-defined]
+@contextmanager
+def _commands(out: Path | None) -> Iterator[Observer | None]:
+    """Writes one row a tick to ``out``."""
+    if out is None:
+        yield None
+        return
+    try:
+        with out.open("w", encoding="ascii") as file:
+            file.write("tick_ns,recorded_command_mw,replayed_command_mw\n")
+
+            def write(tick: LoggedTick, now: Record) -> None:
+                file.write(f"{now.tick_ns},{tick.record.command_mw!r},{now.command_mw!r}\n")
+
+            yield write
+    except SourceError:
+        raise
+    except OSError as error:
+        raise SourceError(f"--out {out}: {error.strerror}") from None

@@ -1,20 +1,26 @@
 """The control loop in real time.
 
 One thread: between ticks it receives and parses, at the tick it computes, drives the output, then logs. The frames a
-tick consumes are those parsed when its time has come, and the log says which they were.
+tick consumes are those parsed when its time has come, and the log says which they were. Ticks that the machine slept
+through are made up for, each with the frames that had arrived by its time.
+
+The session ends at its time, when asked to, or when it can no longer be logged: in all three the command ramps to 0
+first, as after an operator's ``disarm``. Anything else that goes wrong ends it at once. The last datagram says 0 V.
 """
 
 from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from dcon.core.rows import CORE
-from dcon.core.values import Record
+from dcon.core.system import DRIVING, Trigger
+from dcon.core.values import Order, SystemState
 from dcon.drivers.udp_command import UdpCommandDriver
-from dcon.engine import Engine
+from dcon.engine import Engine, Tick
 from dcon.platform.orders import OrderBook, TimedOrder
 from dcon.platform.schedule import TickGrid
 from dcon.session.codec import Timing
@@ -22,10 +28,10 @@ from dcon.session.log import SessionWriter
 from dcon.settings import Settings, Site
 from pmutools import linux
 from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
-from pmutools.clock import Clock, SystemClock, utc_offset
-from pmutools.errors import SettingsError
+from pmutools.clock import Clock, SystemClock, UtcOffset, utc_offset
+from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Chunk
-from pmutools.net.dialogue import LinkEvent
+from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.receiver import Receivers
 
@@ -35,6 +41,25 @@ CLOCK_CHECK_TICKS = 60
 FIFO_PRIORITY = 10
 COARSE_NS = 1_200_000
 """Selectors wait in whole milliseconds: the last stretch before a deadline is slept exactly."""
+CATCH_UP_S = 1
+"""Ticks missed for longer are left out: whatever they would have held up has gone wrong by then."""
+TOLD = 10
+"""Warnings of one kind about streams; more of it go to the verbose log."""
+TROUBLE = frozenset(
+    (
+        LinkKind.FOREIGN,
+        LinkKind.NO_CONFIG,
+        LinkKind.NOTHING,
+        LinkKind.SILENT,
+        LinkKind.LOST,
+        LinkKind.FAILED,
+        LinkKind.UNANSWERED,
+        LinkKind.OWN_DROPS,
+    )
+)
+ENGAGED = DRIVING | {SystemState.ARMED}
+"""States that the end of a session leaves by disarming."""
+_DISARM = (Order(str(Trigger.DISARM)),)
 
 
 @dataclass
@@ -43,17 +68,22 @@ class Summary:
 
     ticks: int = 0
     late_over_1ms: int = 0
+    caught_up_ticks: int = 0
+    """Ticks that ran later than the one after them should have."""
     skipped_ticks: int = 0
-    """Ticks whose time had passed before the loop came to them."""
+    """Ticks left out, after a pause of the machine or a step of UTC."""
+    clock_steps: int = 0
     frames: int = 0
     unread: dict[str, int] = field(default_factory=dict)
     own_drops: int = 0
+    unsent: int = 0
+    """Commands that the system refused to send, or that nobody listened to."""
     final_state: str = ""
 
 
 def endpoint_of(site: Site) -> Endpoint:
     """Where a PMU's stream is received from, its IDCODE included."""
-    return site.url if site.idcode is None else replace(site.url, idcode=site.idcode)
+    return replace(site.url, idcode=site.stream)
 
 
 class Platform:
@@ -64,12 +94,23 @@ class Platform:
         self.settings = settings
         self.clock = clock or SystemClock(spin_ns=SPIN_NS)
         self.engine = Engine(settings.params, settings.sites)
-        self.receivers = Receivers([endpoint_of(site) for site in settings.sites], self.clock)
         self.driver = UdpCommandDriver(settings.output.url) if settings.output.url is not None else None
+        try:
+            self.receivers = Receivers([endpoint_of(site) for site in settings.sites], self.clock)
+        except BaseException:
+            if self.driver is not None:
+                self.driver.close()
+            raise
         self.summary = Summary()
+        self.stopping = False
+        self._log_failure: SourceError | None = None
+        self._told = Counter[LinkKind]()
         self._frames: dict[str, list[Frame]] = {}
         self._configs: list[tuple[str, bytes, int]] = []
-        self._known: dict[str, StreamConfig] = {}
+
+    def stop(self) -> None:
+        """Ask for the end of :meth:`run`, from a signal handler too."""
+        self.stopping = True
 
     def run(
         self,
@@ -78,73 +119,107 @@ class Platform:
         orders: Sequence[TimedOrder] = (),
         start_ns: int | None = None,
         duration_s: float | None = None,
-        observe: Callable[[Record], None] | None = None,
     ) -> Summary:
-        """Run until ``duration_s`` after ``start_ns`` (POSIX UTC; now unless given), or until interrupted.
+        """Run until ``duration_s`` after ``start_ns`` (POSIX UTC; now unless given), or until :meth:`stop`.
 
-        ``orders`` count from ``start_ns``. The output is driven to 0 V at the end, however it comes. Raises
-        SourceError where the log cannot be written, SettingsError where a PMU's first configuration cannot be used.
+        ``orders`` count from ``start_ns``. Raises SourceError where the log cannot be written, SettingsError where a
+        PMU's first configuration cannot be used and no instance is READY yet; later that is an event.
         """
         start_ns = self.clock.realtime_ns() if start_ns is None else start_ns
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
         settings = self.settings
-        writer = SessionWriter(
-            log_path,
-            ini_text=settings.text,
-            configs={},
-            metadata={"start_ns": str(start_ns)},
-            pmus=[site.name for site in settings.sites],
-            instances=settings.params.instance_names,
-            flags=CORE.names,
-        )
         prepare(fifo=settings.platform.fifo)
         try:
-            with writer:
-                self._loop(writer, OrderBook(orders, start_ns), end_ns, observe)
+            with SessionWriter(
+                log_path,
+                ini_text=settings.text,
+                configs={},
+                metadata={"start_ns": str(start_ns)},
+                pmus=[site.name for site in settings.sites],
+                instances=settings.params.instance_names,
+                flags=CORE.names,
+            ) as writer:
+                self._loop(writer, OrderBook(orders, start_ns), end_ns)
         finally:
             gc.unfreeze()
-            self._stop()
+            self._close()
         self.summary.unread = dict(self.engine.unread)
         self.summary.final_state = str(self.engine.state.system)
+        if self._log_failure is not None:
+            raise self._log_failure
         return self.summary
 
-    def _loop(
-        self, log: SessionWriter, book: OrderBook, end_ns: int | None, observe: Callable[[Record], None] | None
-    ) -> None:
+    def _loop(self, log: SessionWriter, book: OrderBook, end_ns: int | None) -> None:
         clock, summary = self.clock, self.summary
         grid = TickGrid(self.settings.params.tick_hz, round(self.settings.platform.phase_ms * 1e6))
         offset = utc_offset(clock)
         index = grid.after(clock.realtime_ns())
         while True:
-            tick_ns = grid.time_ns(index)
-            if end_ns is not None and tick_ns > end_ns:
+            tick_ns, next_ns = grid.time_ns(index), grid.time_ns(index + 1)
+            ending = self.stopping or self._log_failure is not None or (end_ns is not None and tick_ns > end_ns)
+            if ending and self.engine.state.system not in ENGAGED:
                 return
             deadline_ns = offset.monotonic_ns(tick_ns)
             self._receive_until(deadline_ns)
             started_ns = clock.monotonic_ns()
+            missed = started_ns >= offset.monotonic_ns(next_ns)
             orders = book.due(tick_ns)
-            frames, self._frames = self._frames, {}
-            tick = self.engine.tick(frames, orders, tick_ns)
+            if ending:
+                orders = () if self.engine.state.system is SystemState.RAMPDOWN else _DISARM
+            tick = self.engine.tick(self._arrived(tick_ns if missed else None), orders, tick_ns)
             if self.driver is not None:
                 self.driver.send(tick_ns, tick.record.output_v)
             done_ns = clock.monotonic_ns()
-            for name, frame, time_ns in self._configs:
-                log.config(name, frame, time_ns)
-            self._configs = []
             timing = Timing((done_ns - started_ns) / 1e3, (started_ns - deadline_ns) / 1e3)
-            log.tick(tick.record, tick.frames, orders, timing=timing)
-            if observe is not None:
-                observe(tick.record)
+            self._write(log, tick, orders, timing)
             summary.ticks += 1
             summary.frames += len(tick.frames)
             summary.late_over_1ms += started_ns - deadline_ns > 1_000_000
+            summary.caught_up_ticks += missed
             index += 1
-            if summary.ticks % CLOCK_CHECK_TICKS == 0:  # follow a slewed or stepped UTC
-                offset = utc_offset(clock, 3)
-            passed = grid.after(offset.realtime_ns(clock.monotonic_ns())) - index
-            if passed > 0:
-                summary.skipped_ticks += passed
-                index += passed
+            if summary.ticks % CLOCK_CHECK_TICKS == 0:
+                offset = self._follow_utc(offset)
+            index = self._next(grid, index, offset)
+
+    def _follow_utc(self, offset: UtcOffset) -> UtcOffset:
+        """The present offset: UTC may have been stepped."""
+        later = utc_offset(self.clock, 3)
+        if moved_ns := offset.step_ns(later):
+            self.summary.clock_steps += 1
+            LOG.warning("UTC was stepped by %.6f s", moved_ns / 1e9)
+        return later
+
+    def _next(self, grid: TickGrid, index: int, offset: UtcOffset) -> int:
+        """The tick to run: ``index``, unless the time is far from it."""
+        now = grid.after(offset.realtime_ns(self.clock.monotonic_ns()))
+        if index - 1 <= now <= index + CATCH_UP_S * grid.rate_hz:
+            return index
+        self.summary.skipped_ticks += max(now - index, 0)
+        return now
+
+    def _arrived(self, by_ns: int | None) -> dict[str, list[Frame]]:
+        """The frames for a tick, by PMU: all there are, or those that had arrived ``by_ns``."""
+        frames, self._frames = self._frames, {}
+        if by_ns is None:
+            return frames
+        arrived: dict[str, list[Frame]] = {}
+        for name, waiting in frames.items():
+            for frame in waiting:
+                late = frame.arrival_ns is not None and frame.arrival_ns > by_ns
+                (self._frames if late else arrived).setdefault(name, []).append(frame)
+        return arrived
+
+    def _write(self, log: SessionWriter, tick: Tick, orders: Sequence[Order], timing: Timing) -> None:
+        configs, self._configs = self._configs, []
+        if self._log_failure is not None:
+            return
+        try:
+            for name, frame, time_ns in configs:
+                log.config(name, frame, time_ns)
+            log.tick(tick.record, tick.frames, orders, timing=timing)
+        except SourceError as error:
+            LOG.error("%s; disarming, for nothing unrecorded is driven", error)
+            self._log_failure = error
 
     def _receive_until(self, deadline_ns: int) -> None:
         """Receive and parse until shortly before ``deadline_ns``, then wait for it exactly and take what has come."""
@@ -156,11 +231,16 @@ class Platform:
     def _take(self, items: list[Chunk | LinkEvent]) -> None:
         for item in items:
             if not isinstance(item, Chunk):
-                self.summary.own_drops += item.datagrams
-                LOG.info("%s %s %s", item.kind, item.where, item.detail)
+                self._tell(item)
             for found in self.receivers.parse(item):
                 if isinstance(found, Message):
                     self._route(found)
+
+    def _tell(self, news: LinkEvent) -> None:
+        self.summary.own_drops += news.datagrams
+        self._told[news.kind] += 1
+        level = logging.WARNING if news.kind in TROUBLE and self._told[news.kind] <= TOLD else logging.INFO
+        LOG.log(level, "%s: %s %s", news.where, news.kind, news.detail)
 
     def _route(self, message: Message) -> None:
         frame, flow, config = message
@@ -168,22 +248,30 @@ class Platform:
             name = self.settings.sites[owner].name
             if frame.type is FrameType.DATA:
                 self._frames.setdefault(name, []).append(frame)
-            elif config is not None and frame.type is not FrameType.CFG1 and self._known.get(name) != config:
-                problem = self.engine.reconfigure(name, config)
-                if problem is not None and name not in self._known:
-                    raise SettingsError(problem)
-                self._known[name] = config
-                self._configs.append((name, frame.data, frame.arrival_ns or 0))
+            elif config is not None and frame.type is not FrameType.CFG1:
+                self._configure(name, config, frame)
 
-    def _stop(self) -> None:
+    def _configure(self, name: str, config: StreamConfig, frame: Frame) -> None:
+        engine = self.engine
+        known = engine.configs.get(name)
+        if known == config:
+            return
+        if (problem := engine.reconfigure(name, config)) is not None:
+            if known is None and engine.state.system is SystemState.INIT:
+                raise SettingsError(problem)
+            LOG.warning("%s", problem)
+        self._configs.append((name, frame.data, frame.arrival_ns or 0))
+
+    def _close(self) -> None:
         if self.driver is not None:
             self.driver.send(self.clock.realtime_ns(), 0.0)
+            self.summary.unsent = self.driver.failed
             self.driver.close()
         self.receivers.close()
 
 
 def prepare(*, fifo: bool) -> None:
-    """Make this process fit for a fixed rhythm, as far as it may: no collector, little timer slack, FIFO, locked."""
+    """Make this process fit for a fixed rhythm, as far as it may: no garbage to go over, little timer slack, FIFO."""
     gc.collect()
     gc.freeze()
     linux.timer_slack()

@@ -31,6 +31,10 @@ def parse_order(text: str) -> TimedOrder:
         raise SettingsError(f"--order {text}: write SECONDS:NAME or SECONDS:NAME=VALUE, as in 30:arm or 40:gain=12")
     if name not in ORDERS:
         raise SettingsError(f"--order {text}: {name!r} is no order; {suggestion(name, map(str, ORDERS))}")
+    if name == "gain" and not equals:
+        raise SettingsError(f"--order {text}: no value; write {when}:gain=MW_PER_MHZ")
+    if equals and name != "gain":
+        raise SettingsError(f"--order {text}: {name} takes no value")
     return TimedOrder(at_ns, Order(name, amount))
 
 

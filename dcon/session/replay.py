@@ -1,8 +1,9 @@
 """``dcon replay``: a recorded session through the same engine again, from its logged bytes and arrivals.
 
-With the session's own settings every command must come out the same, to the last bit; the first difference is
-reported with its inputs. With changed settings the result is what the controller would have *commanded*: the grid
-that answered is the recorded one, so nothing is said of what the grid would have done.
+With the session's own settings every record must come out the same, to the last bit, and every frame must hold its
+CHK and decode to what the log says; the first difference is reported with the tick's inputs. With changed settings
+the result is what the controller would have *commanded*: the grid that answered is the recorded one, so nothing is
+said of what the grid would have done.
 """
 
 from __future__ import annotations
@@ -13,19 +14,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from dcon.core.values import Event, Record
+from dcon.core.values import Record
 from dcon.engine import Engine
 from dcon.session.log import LoggedTick, SessionReader
 from dcon.settings import parse
 from pmutools.c37118 import Frame, decode_config
+from pmutools.c37118.checksum import chk
 from pmutools.errors import SourceError, WireError
+from pmutools.schema.pmu_log import PmuFrame
 
 Observer = Callable[[LoggedTick, Record], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first field of a tick's record that came out otherwise."""
+    """The first field of a tick's record that came out otherwise, or ``frame`` and the one that is not as logged."""
 
     tick_ns: int
     field: str
@@ -86,15 +89,17 @@ def replay(path: str, changes: Sequence[str] = (), observe: Observer | None = No
         for frame in tick.frames:
             arrived = Frame(frame.wire, frame.arrival_ns, frame.stamp_source, 0)
             frames.setdefault(frame.name, []).append(arrived)
-        record = engine.tick(frames, tick.orders, tick.record.tick_ns).record
+        now = engine.tick(frames, tick.orders, tick.record.tick_ns)
         result.ticks += 1
-        result.largest_mw = max(result.largest_mw, abs(record.command_mw - tick.record.command_mw))
-        if not identical(tick.record, record):
+        result.largest_mw = max(result.largest_mw, abs(now.record.command_mw - tick.record.command_mw))
+        found = (None if changes else _changed_frame(tick, now.frames)) or _changed_record(tick.record, now.record)
+        if found is not None:
             result.different += 1
-            if result.first is None:
-                result.first = _difference(tick, record)
+            result.first = result.first or _difference(tick, *found)
         if observe is not None:
-            observe(tick, record)
+            observe(tick, now.record)
+    if not result.stopped and (reader.damage or reader.incomplete_ticks):
+        result.stopped = "; ".join(reader.damage.lines()) or "the last tick is not whole"
     if not result.ticks and not result.stopped:
         raise SourceError(f"{path}: holds no tick")
     return result
@@ -116,6 +121,8 @@ def _configure(engine: Engine, tick: LoggedTick, result: Replay) -> None:
 
 def identical(one: object, other: object) -> bool:
     """Equal to the last bit, NaN and -0.0 too, through tuples."""
+    if isinstance(one, complex) and isinstance(other, complex):
+        one, other = (one.real, one.imag), (other.real, other.imag)
     if isinstance(one, float) and isinstance(other, float):
         return struct.pack("<d", one) == struct.pack("<d", other) or (math.isnan(one) and math.isnan(other))
     if isinstance(one, tuple) and isinstance(other, tuple):
@@ -123,15 +130,31 @@ def identical(one: object, other: object) -> bool:
     return one == other
 
 
-def _difference(tick: LoggedTick, record: Record) -> Difference:
-    fields = zip(Record._fields, tick.record, record, strict=True)
-    name, recorded, replayed = next(entry for entry in fields if not identical(entry[1], entry[2]))
+def _difference(tick: LoggedTick, name: str, recorded: object, replayed: object) -> Difference:
     inputs = [f"{frame.name} stamp {frame.time_ns} arrival {frame.arrival_ns}" for frame in tick.frames]
     inputs += [f"order {order.name} {order.value:g}" for order in tick.orders]
-    return Difference(tick.record.tick_ns, name, _brief(recorded), _brief(replayed), tuple(inputs))
+    return Difference(tick.record.tick_ns, name, recorded, replayed, tuple(inputs))
 
 
-def _brief(value: object) -> object:
-    if isinstance(value, tuple) and value and isinstance(value[0], Event):
-        return [f"{event.name} {event.subject}" for event in value]
-    return value
+def _changed_record(recorded: object, replayed: object, name: str = "") -> tuple[str, object, object] | None:
+    """The first value that differs, with its place: ``instances.3.command_mw``."""
+    if identical(recorded, replayed):
+        return None
+    if isinstance(recorded, tuple) and isinstance(replayed, tuple) and len(recorded) == len(replayed):
+        places = getattr(recorded, "_fields", range(len(recorded)))
+        for place, one, other in zip(places, recorded, replayed, strict=True):
+            if found := _changed_record(one, other, f"{name}.{place}" if name else str(place)):
+                return found
+    return name, recorded, replayed
+
+
+def _changed_frame(tick: LoggedTick, frames: Sequence[PmuFrame]) -> tuple[str, object, object] | None:
+    """The first frame that is not what was received: its bytes, or what the log says they mean, were changed."""
+    if len(frames) != len(tick.frames):
+        return "frame", f"{len(tick.frames)} frames", f"{len(frames)} of them readable"
+    for logged, read in zip(tick.frames, frames, strict=True):
+        if chk(logged.wire):
+            return "frame", f"{logged.name} {logged.wire.hex()}", "CHK does not hold"
+        if not identical(logged._replace(tick_ns=0), read):
+            return "frame", f"{logged.name} {logged.time_ns}", "decodes otherwise"
+    return None

@@ -1,0 +1,282 @@
+"""``dcon replay``: the same records bit for bit, or the first difference; and whatever may be wrong with a log."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dcon.cli import dcon
+from dcon.core.values import Event
+from dcon.session.log import LoggedTick, SessionReader, SessionWriter
+from dcon.session.replay import identical, replay
+from dcon.sim.plan import Plan
+from dcon.sim.simulate import simulate
+from pmutools.cli.shell import run
+from pmutools.flow import StampSource
+from pmutools.schema.log_writer import LogWriter
+from pmutools.schema.pmu_log import PmuFrame
+
+Capsys = pytest.CaptureFixture[str]
+Edit = Callable[[LoggedTick], LoggedTick]
+PLAN = Plan(gain_mw_per_mhz=12, faults=("table1-delays",), noise_rad=1e-4, duration_s=6)
+
+
+EDITED = 330
+"""The tick that tampering is with: the brake is in, and the command far from 0."""
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("replay") / "session.mcap"
+    simulate(PLAN, str(path))
+    return path
+
+
+def rewritten(session: Path, out: Path, edit: Edit = lambda tick: tick, ini: str | None = None) -> Path:
+    """The session written anew, every tick through ``edit``."""
+    reader = SessionReader(session)
+    with SessionWriter(
+        out,
+        ini_text=reader.ini_text if ini is None else ini,
+        configs=reader.configs,
+        metadata={key: value for key, value in reader.metadata.items() if key not in ("pmus", "instances", "flags")},
+        pmus=reader.pmus,
+        instances=reader.instances,
+        flags=reader.flags,
+    ) as log:
+        for number, tick in enumerate(reader.ticks()):
+            changed = edit(tick) if number == EDITED else tick
+            log.tick(changed.record, changed.frames, changed.orders, timing=changed.timing)
+    return out
+
+
+def told(capsys: Capsys, *arguments: str) -> tuple[int, str, str]:
+    code = run(dcon(), ["replay", *arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_a_simulated_session_replays_bit_for_bit(session: Path, capsys: Capsys) -> None:
+    code, out, _ = told(capsys, str(session))
+    assert (code, out) == (0, "360 ticks: identical\n")
+    code, out, _ = told(capsys, str(session), "--json")
+    assert code == 0
+    assert json.loads(out) == {
+        "ticks": 360,
+        "different": 0,
+        "first": None,
+        "changes": [],
+        "stopped": None,
+        "problems": [],
+        "largest_command_change_mw": 0.0,
+    }
+
+
+def test_the_records_are_those_of_the_log(session: Path) -> None:
+    ticks = list(SessionReader(session).ticks())
+    seen: list[bool] = []
+    replay(str(session), observe=lambda tick, now: seen.append(identical(tick.record, now)))
+    assert seen == [True] * len(ticks)
+    assert max(abs(tick.record.command_mw) for tick in ticks) > 30  # there was something to get wrong
+    assert sum(len(tick.record.events) for tick in ticks) > 20
+
+
+def test_a_session_written_anew_is_the_same(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    assert told(capsys, str(rewritten(session, tmp_path / "again.mcap")))[0] == 0
+
+
+def frame_changed(**given: object) -> Edit:
+    def edit(tick: LoggedTick) -> LoggedTick:
+        first, *others = tick.frames
+        return tick._replace(frames=(first._replace(**given), *others))  # type: ignore[arg-type]
+
+    return edit
+
+
+def bit_flipped(at: int) -> Edit:
+    def edit(tick: LoggedTick) -> LoggedTick:
+        wire = bytearray(tick.frames[0].wire)
+        wire[at] ^= 1
+        return frame_changed(wire=bytes(wire))(tick)
+
+    return edit
+
+
+def record_changed(**given: object) -> Edit:
+    return lambda tick: tick._replace(record=tick.record._replace(**given))  # type: ignore[arg-type]
+
+
+def instance_changed(tick: LoggedTick) -> LoggedTick:
+    instances = list(tick.record.instances)
+    instances[3] = instances[3]._replace(command_mw=1.0)
+    return tick._replace(record=tick.record._replace(instances=tuple(instances)))
+
+
+TAMPERED: dict[str, tuple[Edit, str]] = {
+    "a bit of V1": (bit_flipped(20), "CHK does not hold"),
+    "a bit of a current": (bit_flipped(50), "CHK does not hold"),
+    "a bit of CHK": (bit_flipped(-1), "CHK does not hold"),
+    "a bit of SYNC": (bit_flipped(0), "of them readable"),
+    "the decoded frequency": (frame_changed(frequency_hz=61.0), "decodes otherwise"),
+    "the arrival": (lambda tick: frame_changed(arrival_ns=tick.frames[0].time_ns + 95_000_000)(tick), "flags 0 -> "),
+    "a frame lost": (lambda tick: tick._replace(frames=tick.frames[1:]), "f_hz."),
+    "the command": (record_changed(command_mw=1.5), "command_mw 1.5 -> "),
+    "minus zero": (record_changed(probe_mw=-0.0), "probe_mw -0.0 -> 0.0"),
+    "an instance": (instance_changed, "instances.3.command_mw 1.0 -> "),
+    "an event": (record_changed(events=(Event("selected", "N1-S1"),)), "events (Event(name='selected'"),
+}
+
+
+@pytest.mark.parametrize(("edit", "said"), TAMPERED.values(), ids=TAMPERED)
+def test_a_changed_log_is_told_with_the_first_difference_and_its_inputs(
+    edit: Edit, said: str, session: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    path = rewritten(session, tmp_path / "tampered.mcap", edit)
+    code, out, _ = told(capsys, str(path))
+    assert code == 3
+    assert out.count("\n") == 1
+    head, _, first = out.partition(" of 360 ticks differ; first: ")
+    assert int(head) >= 1
+    tick = list(SessionReader(path).ticks())[EDITED]
+    assert first.startswith(f"tick {tick.record.tick_ns}: ") and said in first
+    assert all(f"{f.name} stamp {f.time_ns} arrival {f.arrival_ns}" in first for f in tick.frames)
+
+
+def test_settings_can_be_changed(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out_path = tmp_path / "commands.csv"
+    code, out, _ = told(capsys, str(session), "--set", "controller.gain_mw_per_mhz=6", "--out", str(out_path))
+    assert code == 0
+    assert "with controller.gain_mw_per_mhz=6: commands differ by up to" in out
+    rows = list(csv.DictReader(out_path.read_text().splitlines()))
+    assert len(rows) == 360
+    for row in rows[310:330]:  # the brake is in: half the gain is half the command
+        assert float(row["replayed_command_mw"]) == pytest.approx(float(row["recorded_command_mw"]) / 2, rel=1e-9)
+    code, out, _ = told(capsys, str(session), "--set", "controller.gain_mw_per_mhz=12")
+    assert code == 0 and "differ by up to 0.000 MW" in out
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("controller.gain=6", "--set: [controller] gain: unknown key"),
+        ("controller.gain_mw_per_mhz=60", "--set: [controller] gain_mw_per_mhz: 60 MW/mHz is above"),
+        ("gain=6", "--set: 'gain=6' is not SECTION.KEY=VALUE"),
+    ],
+)
+def test_a_change_that_cannot_be(change: str, said: str, session: Path, capsys: Capsys) -> None:
+    code, _, err = told(capsys, str(session), "--set", change)
+    assert code == 2 and said in err and err.count("\n") == 1
+
+
+def test_a_cut_log_replays_to_the_cut_and_says_so(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "cut.mcap"
+    whole = session.read_bytes()
+    path.write_bytes(whole[: len(whole) * 2 // 3])
+    code, out, err = told(capsys, str(path))
+    assert code == 3
+    assert 100 < int(out.split()[0]) < 360 and "ticks: identical" in out
+    assert "stopped: the log has no intact end" in err
+
+
+def test_a_hole_in_a_log_ends_the_replay_there(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "hole.mcap"
+    whole = bytearray(session.read_bytes())
+    middle = len(whole) // 2
+    whole[middle : middle + 64] = bytes(64)
+    path.write_bytes(whole)
+    code, out, err = told(capsys, str(path))
+    assert code == 3
+    assert int(out.split()[0]) < 360
+    assert "stopped: the log lost something before tick" in err
+
+
+def foreign(path: Path) -> None:
+    with LogWriter(path) as log:
+        log.metadata("other", {"key": "value"})
+
+
+def no_ini(path: Path) -> None:
+    with SessionWriter(path, ini_text="", configs={}, metadata={}, pmus=(), instances=()):
+        pass
+
+
+NO_SESSIONS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no file": (lambda path: None, "No such file or directory"),
+    "an empty file": (lambda path: path.write_bytes(b""), "empty file"),
+    "text": (lambda path: path.write_text("tick_ns,command_mw\n"), "not an MCAP file"),
+    "another MCAP file": (foreign, "not a session log"),
+    "no settings": (no_ini, "holds no initialisation file (its beginning is lost), so no replay"),
+    "a folder": (lambda path: path.mkdir(), "Is a directory"),
+}
+
+
+@pytest.mark.parametrize(("make", "said"), NO_SESSIONS.values(), ids=NO_SESSIONS)
+def test_what_is_no_session_fails_in_one_line(
+    make: Callable[[Path], object], said: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    path = tmp_path / "x.mcap"
+    make(path)
+    code, out, err = told(capsys, str(path))
+    assert (code, out) == (1, "")
+    assert err.startswith(f"dcon: {path}: ") and said in err and err.count("\n") == 1
+
+
+def test_a_session_without_ticks(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "x.mcap"
+    reader = SessionReader(session)
+    with SessionWriter(path, ini_text=reader.ini_text, configs={}, metadata={}, pmus=reader.pmus, instances=()):
+        pass
+    code, _, err = told(capsys, str(path))
+    assert code == 1 and err == f"dcon: {path}: holds no tick\n"
+
+
+def test_settings_that_cannot_be_name_the_log_and_the_line(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = rewritten(session, tmp_path / "x.mcap", ini="[controller]\ngain = 9\n[pmu A]\nurl = udp://h:1\n")
+    code, _, err = told(capsys, str(path))
+    assert code == 2 and err.startswith(f"dcon: {path}: initialisation file:2: [controller] gain: unknown key")
+
+
+def test_an_output_that_cannot_be_written(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    code, _, err = told(capsys, str(session), "--out", str(tmp_path / "no" / "x.csv"))
+    assert code == 1 and err.startswith("dcon: --out ") and err.count("\n") == 1
+
+
+def test_a_frame_of_a_pmu_that_the_settings_lack_is_a_difference(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = rewritten(session, tmp_path / "x.mcap", frame_changed(name="N9"))
+    code, out, _ = told(capsys, str(path))
+    assert code == 3 and "frame '8 frames' -> '7 of them readable'" in out
+
+
+def test_equal_to_the_last_bit() -> None:
+    nan = float("nan")
+    frame = PmuFrame(
+        "N1", b"", 0, None, StampSource.USER, 0, 0, nan, v1=complex(nan, -0.0), phasors=(complex(nan, nan),)
+    )
+    assert identical(frame, frame._replace(frequency_hz=float("nan"), v1=complex(float("nan"), -0.0)))
+    assert not identical(frame, frame._replace(v1=complex(nan, 0.0)))
+    assert not identical((1.0, 2.0), (1.0,))
+    assert not identical(0.0, -0.0)
+    assert identical((1, "a", None), (1, "a", None))
+
+
+def test_a_damaged_configuration_is_a_problem_that_is_told(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "x.mcap"
+    reader = SessionReader(session)
+    configs = dict(reader.configs)
+    configs["N1"] = configs["N1"][:-1] + b"\0"
+    with SessionWriter(
+        path,
+        ini_text=reader.ini_text,
+        configs=configs,
+        metadata={"verified": "true"},
+        pmus=reader.pmus,
+        instances=reader.instances,
+    ) as log:
+        for tick in list(reader.ticks())[:30]:
+            log.tick(tick.record, tick.frames, tick.orders)
+    code, _, err = told(capsys, str(path))
+    assert code == 3 and "N1: CHK is" in err
