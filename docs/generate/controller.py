@@ -132,14 +132,18 @@ def numbers(cls: type, leave_out: Iterable[str] = ()) -> str:
     return table(("key", "default", "unit", "range", "meaning", "source"), rows)
 
 
+KEY_WORDS = {"path": "Where the session log goes; `--log` goes over it."}
+"""Keys whose names say enough in code."""
+
+
 def keys(cls: type) -> str:
     """Settings of a section that is read as text."""
-    says = attribute_docs(cls)
+    says = KEY_WORDS | attribute_docs(cls)
     rows = []
     for item in fields(cls):
         if "parse" in item.metadata:
             default = "required" if item.default is MISSING else _default(item.default)
-            rows.append((code(item.name), default, says.get(item.name, "")))
+            rows.append((code(item.name), default, says[item.name]))
     return table(("key", "default", "meaning"), rows)
 
 
