@@ -7,25 +7,32 @@ clock and no socket; what it cannot read is counted and treated as missing, so n
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 from dcon.core.params import Params
 from dcon.core.pmu import end_run
 from dcon.core.state import State, initial_state
 from dcon.core.step import step
 from dcon.core.values import Event, Inputs, Mode, Order, Record, Sample
-from dcon.frontend import Binding, bind
+from dcon.frontend import Binding, Reading, bind
 from dcon.settings import Site
 from pmutools.c37118 import Frame, StreamConfig
 from pmutools.errors import SettingsError, WireError
 from pmutools.schema.pmu_log import PmuFrame
 
 
-class Tick(NamedTuple):
-    """What one tick decided, and the frames it consumed as log entries, in the order consumed."""
+@dataclass(frozen=True)
+class Tick:
+    """What one tick decided, and what it read, in the order read."""
 
     record: Record
-    frames: tuple[PmuFrame, ...]
+    readings: tuple[Reading, ...]
+
+    @cached_property
+    def frames(self) -> tuple[PmuFrame, ...]:
+        """The frames read, as log entries."""
+        return tuple(reading.entry() for reading in self.readings)
 
 
 class Engine:
@@ -88,7 +95,7 @@ class Engine:
     def tick(self, frames: Mapping[str, Iterable[Frame]], orders: tuple[Order, ...], now_ns: int) -> Tick:
         """Run one tick at ``now_ns`` with the data frames of each PMU that arrived since the last, in order."""
         samples: list[list[Sample]] = [[] for _ in self.sites]
-        logged: list[PmuFrame] = []
+        readings: list[Reading] = []
         for name, arrived in frames.items():
             binding = self.bindings.get(name)
             for frame in arrived:
@@ -96,17 +103,17 @@ class Engine:
                 if read is None:
                     self.unread[name] = self.unread.get(name, 0) + 1
                 else:
-                    samples[self._index[name]].append(read[0])
-                    logged.append(read[1])
+                    samples[self._index[name]].append(read.sample)
+                    readings.append(read)
         inputs = Inputs(tuple(map(tuple, samples)), orders)
         self.state, record = step(self.params, self.state, inputs, now_ns)
         if self._notes:
             record = record._replace(events=(*self._notes, *record.events))
             self._notes = []
-        return Tick(record, tuple(logged))
+        return Tick(record, tuple(readings))
 
 
-def _read(binding: Binding, frame: Frame) -> tuple[Sample, PmuFrame] | None:
+def _read(binding: Binding, frame: Frame) -> Reading | None:
     try:
         return binding.read(frame)
     except WireError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from dcon.core.sequence import positive_sequence
 from dcon.core.values import Sample
@@ -24,22 +25,22 @@ class Binding:
     voltage: tuple[int, ...]
     """Columns of V1, or of VA, VB and VC."""
 
-    def read(self, frame: Frame) -> tuple[Sample, PmuFrame] | None:
-        """A data frame as the controller's sample and as a log entry; None where it is not of this configuration."""
+    def read(self, frame: Frame) -> Reading | None:
+        """A data frame as the controller sees it; None where it is not of this configuration."""
         if len(frame.data) != self.layout.frame_size:
             return None
         data = unpack_data(frame.data, self.config, self.layout)
-        v1 = self.v1(data)
+        time_ns = data.time_ns
         sample = Sample(
-            data.time_ns,
-            data.time_ns if frame.arrival_ns is None else frame.arrival_ns,
-            v1,
+            time_ns,
+            time_ns if frame.arrival_ns is None else frame.arrival_ns,
+            self.v1(data),
             data.frequency(self.station),
             data.stat(self.station),
             data.time_quality,
             self.layout.time_base,
         )
-        return sample, pmu_frame(self.name, frame, data, station=self.station, v1=v1)
+        return Reading(self, frame, data, sample)
 
     def reads_like(self, other: Binding) -> bool:
         """Whether both make the same sample of every frame."""
@@ -54,6 +55,20 @@ class Binding:
         if len(self.voltage) == 1:
             return data.phasor(self.voltage[0])
         return positive_sequence(*map(data.phasor, self.voltage))
+
+
+class Reading(NamedTuple):
+    """A data frame that was read. What the log wants of it is worked out when it is asked for: control comes first."""
+
+    binding: Binding
+    frame: Frame
+    data: Data
+    sample: Sample
+
+    def entry(self) -> PmuFrame:
+        """The frame as a log entry."""
+        name, station = self.binding.name, self.binding.station
+        return pmu_frame(name, self.frame, self.data, station=station, v1=self.sample.v1)
 
 
 def _meaning(layout: Layout) -> tuple[object, ...]:

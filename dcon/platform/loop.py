@@ -173,7 +173,7 @@ class Platform:
             timing = Timing((done_ns - started_ns) / 1e3, (started_ns - deadline_ns) / 1e3)
             self._write(log, tick, orders, timing)
             summary.ticks += 1
-            summary.frames += len(tick.frames)
+            summary.frames += len(tick.readings)
             summary.late_over_1ms += started_ns - deadline_ns > 1_000_000
             summary.caught_up_ticks += missed
             index += 1

@@ -39,7 +39,7 @@ def test_one_station_of_a_concentrator(station: int, voltage: tuple[str, ...]) -
     binding = bind("X", CONCENTRATOR.config, rate_hz=60, voltage=voltage, station=name)
     read = binding.read(frame(CONCENTRATOR))
     assert read is not None
-    sample, logged = read
+    sample, logged = read.sample, read.entry()
     expected = reports()[station]
     assert sample.v1 == pytest.approx(expected.v1, rel=1e-6)
     assert (sample.time_ns, sample.arrival_ns, sample.stat) == (START_NS, START_NS + 60_000_000, 0)
@@ -60,9 +60,9 @@ def test_v1_of_phases_is_free_of_negative_and_zero_sequence() -> None:
         Frame(stream.data_frame([report]), None, StampSource.KERNEL, 0)
     )
     assert read is not None
-    assert read[0].v1 == pytest.approx(v1, rel=1e-6)
-    assert read[0].arrival_ns == START_NS  # nobody took the arrival
-    assert read[1].arrival_ns is None
+    assert read.sample.v1 == pytest.approx(v1, rel=1e-6)
+    assert read.sample.arrival_ns == START_NS  # nobody took the arrival
+    assert read.entry().arrival_ns is None
 
 
 def test_a_frame_of_another_size_is_not_read() -> None:
