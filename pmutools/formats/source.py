@@ -169,9 +169,10 @@ class Gatherer:
                 block, run = run.block(flow), None
             if run is None:
                 run = self._runs[key] = _Run(config)
-        run.frames.append(frame.data)
-        run.arrivals.append(NO_TIME if frame.arrival_ns is None else frame.arrival_ns)
-        run.sources.append(frame.stamp_source)
+        data, arrival_ns, source, _ = frame
+        run.frames.append(data)
+        run.arrivals.append(NO_TIME if arrival_ns is None else arrival_ns)
+        run.sources.append(source)
         if block is None and len(run.frames) >= self.frames:
             block = self._runs.pop(key).block(flow)
         return block
@@ -186,8 +187,9 @@ class Gatherer:
 def gather(items: Iterable[Message | Loss], frames: int = BLOCK_FRAMES) -> Iterator[Block | Message | Loss]:
     """Data messages gathered into blocks of up to ``frames``; everything else passes through."""
     gatherer = Gatherer(frames)
+    data = FrameType.DATA
     for item in items:
-        if isinstance(item, Message) and item.frame.type is FrameType.DATA:
+        if isinstance(item, Message) and item.frame.type is data:
             if (block := gatherer.add(item)) is not None:
                 yield block
         else:
