@@ -1,8 +1,8 @@
 """The control loop in real time.
 
-One thread: between ticks it receives and parses, at the tick it computes, drives the output, then logs. The frames a
-tick consumes are those parsed when its time has come, and the log says which they were. Ticks that the machine slept
-through are made up for, each with the frames that had arrived by its time.
+One thread: between ticks it receives and parses, at the tick it computes, drives the output, then logs. A tick consumes
+the frames that had arrived by its time, and the log says which they were; so a tick that runs late decides what it
+would have decided in time, and ticks that the machine slept through are made up for.
 
 The session ends at its time, when asked to, or when it can no longer be logged: in all three the command ramps to 0
 first, as after an operator's ``disarm``. Anything else that goes wrong ends it at once. The last datagram says 0 V.
@@ -34,6 +34,7 @@ from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.receiver import Receivers
+from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 SPIN_NS = 200_000
@@ -41,6 +42,7 @@ CLOCK_CHECK_TICKS = 60
 FIFO_PRIORITY = 10
 COARSE_NS = 1_200_000
 """Selectors wait in whole milliseconds: the last stretch before a deadline is slept exactly."""
+LATEST_NS = NS
 CATCH_UP_S = 1
 """Ticks missed for longer are left out: whatever they would have held up has gone wrong by then."""
 TOLD = 10
@@ -155,18 +157,17 @@ class Platform:
         offset = utc_offset(clock)
         index = grid.after(clock.realtime_ns())
         while True:
-            tick_ns, next_ns = grid.time_ns(index), grid.time_ns(index + 1)
+            tick_ns = grid.time_ns(index)
             ending = self.stopping or self._log_failure is not None or (end_ns is not None and tick_ns > end_ns)
             if ending and self.engine.state.system not in ENGAGED:
                 return
             deadline_ns = offset.monotonic_ns(tick_ns)
             self._receive_until(deadline_ns)
             started_ns = clock.monotonic_ns()
-            missed = started_ns >= offset.monotonic_ns(next_ns)
             orders = book.due(tick_ns)
             if ending:
                 orders = () if self.engine.state.system is SystemState.RAMPDOWN else _DISARM
-            tick = self.engine.tick(self._arrived(tick_ns if missed else None), orders, tick_ns)
+            tick = self.engine.tick(self._arrived(tick_ns), orders, tick_ns)
             if self.driver is not None:
                 self.driver.send(tick_ns, tick.record.output_v)
             done_ns = clock.monotonic_ns()
@@ -175,7 +176,7 @@ class Platform:
             summary.ticks += 1
             summary.frames += len(tick.readings)
             summary.late_over_1ms += started_ns - deadline_ns > 1_000_000
-            summary.caught_up_ticks += missed
+            summary.caught_up_ticks += started_ns >= offset.monotonic_ns(grid.time_ns(index + 1))
             index += 1
             if summary.ticks % CLOCK_CHECK_TICKS == 0:
                 offset = self._follow_utc(offset)
@@ -197,16 +198,14 @@ class Platform:
         self.summary.skipped_ticks += max(now - index, 0)
         return now
 
-    def _arrived(self, by_ns: int | None) -> dict[str, list[Frame]]:
-        """The frames for a tick, by PMU: all there are, or those that had arrived ``by_ns``."""
+    def _arrived(self, tick_ns: int) -> dict[str, list[Frame]]:
+        """The frames for a tick, by PMU; those that came after it wait, unless their stamp is a clock's mistake."""
         frames, self._frames = self._frames, {}
-        if by_ns is None:
-            return frames
         arrived: dict[str, list[Frame]] = {}
         for name, waiting in frames.items():
             for frame in waiting:
-                late = frame.arrival_ns is not None and frame.arrival_ns > by_ns
-                (self._frames if late else arrived).setdefault(name, []).append(frame)
+                later = tick_ns < (frame.arrival_ns or 0) <= tick_ns + LATEST_NS
+                (self._frames if later else arrived).setdefault(name, []).append(frame)
         return arrived
 
     def _write(self, log: SessionWriter, tick: Tick, orders: Sequence[Order], timing: Timing) -> None:
