@@ -95,9 +95,11 @@ class Data:
         at, polar, floating, factor, turn = self.layout.phasors[column]
         first, second = self.values[at], self.values[at + 1]
         if polar:
-            if floating:
-                return _polar(factor * first, second - turn)
-            return _NAN_PHASOR if second == INT16_FILLER else _polar(factor * first, second * RAD_PER_COUNT - turn)
+            angle = (second if floating else second * RAD_PER_COUNT) - turn
+            if math.isinf(angle) or (second == INT16_FILLER and not floating):
+                return _NAN_PHASOR
+            magnitude = factor * first
+            return complex(magnitude * math.cos(angle), magnitude * math.sin(angle))
         if not floating and first == INT16_FILLER and second == INT16_FILLER:
             return _NAN_PHASOR
         value = complex(factor * first, factor * second)
@@ -125,26 +127,26 @@ class Data:
         return self.values[at] * multiplier + offset
 
     def station(self, station: int = 0) -> StationData:
-        slots = self.layout.slots[station]
+        values, slots = self.values, self.layout.slots[station]
+        if slots.parts is not None:
+            phasors = tuple(map(complex, values[slots.parts[0]], values[slots.parts[1]]))
+        else:
+            phasors = tuple(map(self.phasor, slots.phasor_columns))
+        stat, frequency = values[slots.stat], self.frequency(station)
+        present = not math.isnan(frequency) or not all(map(cmath.isnan, phasors))
         return StationData(
-            self.stat(station),
-            self.valid(station),
-            tuple(map(self.phasor, slots.phasor_columns)),
-            self.frequency(station),
+            stat,  # type: ignore[arg-type]
+            present and not stat & STAT_DATA_ERROR_MASK,  # type: ignore[operator]
+            phasors,
+            frequency,
             self.rocof(station),
-            tuple(map(self.analog, slots.analog_columns)),
-            tuple(int(self.values[index]) for index in slots.digitals),
+            tuple(map(self.analog, slots.analog_columns)) if slots.analog_columns else (),
+            values[slots.digitals.start : slots.digitals.stop],  # type: ignore[arg-type]
         )
 
     @property
     def stations(self) -> tuple[StationData, ...]:
         return tuple(map(self.station, range(len(self.layout.slots))))
-
-
-def _polar(magnitude: float, angle: float) -> complex:
-    if math.isinf(angle):
-        return _NAN_PHASOR
-    return complex(magnitude * math.cos(angle), magnitude * math.sin(angle))
 
 
 def decode_data(frame: bytes, config: StreamConfig) -> Data:

@@ -64,6 +64,8 @@ class StationSlots(NamedTuple):
     freq_float: bool
     fnom_hz: float
     digitals: range
+    parts: tuple[slice, slice] | None
+    """Real and imaginary parts, where these are the phasors as they stand: floats without factor and turn."""
     phasor_columns: range
     analog_columns: range
     digital_columns: range
@@ -159,6 +161,7 @@ def layout_of(config: StreamConfig) -> Layout:
                 bool(station.format & Format.FREQ_FLOAT),
                 station.fnom_hz,
                 range(first_digital, first_digital + words),
+                _parts(phasors[first_phasor:]),
                 range(first_phasor, len(phasors)),
                 range(first_analog, len(analogs)),
                 range(digital_column, digital_column + words),
@@ -178,6 +181,16 @@ def layout_of(config: StreamConfig) -> Layout:
         config.time_base,
         tuple(_runs(config, stations, slots)),
     )
+
+
+_PLAIN = PhasorSlot(0, polar=False, floating=True, factor=1.0, angle_offset_rad=0.0)[1:]
+
+
+def _parts(phasors: Sequence[PhasorSlot]) -> tuple[slice, slice] | None:
+    if not phasors or any(slot[1:] != _PLAIN for slot in phasors):
+        return None
+    first, last = phasors[0].first, phasors[-1].first
+    return slice(first, last + 1, 2), slice(first + 1, last + 2, 2)
 
 
 def _runs(config: StreamConfig, stations: Sequence[tuple[Field, ...]], slots: Sequence[StationSlots]) -> Iterator[Run]:
