@@ -35,6 +35,12 @@ def buses(time_ns: int) -> dict[str, Bus]:
     return {"north": north, "south": Bus(-north.angle_rad, -north.deviation_hz, -north.rocof_hz_s)}
 
 
+def peak_after(time_ns: int) -> int:
+    """The next time at which the difference is largest, of either sign."""
+    half_ns = round(NS / SWING_HZ / 2)
+    return time_ns + (half_ns // 2 - (time_ns - START_NS)) % half_ns
+
+
 class Streams:
     """The frames of some PMUs, each a stream of its own."""
 
