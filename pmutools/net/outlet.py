@@ -22,7 +22,7 @@ from pmutools.net.tcp import TcpListener, TcpPeer
 from pmutools.net.udp import Batches, UdpSocket, target
 
 MAX_CLIENTS = 1024
-"""Clients of one listening endpoint; more are turned away."""
+"""Clients of one listening endpoint: of TCP more are turned away, of UDP the one heard longest ago makes room."""
 GARBAGE_BYTES = 64 << 10
 """Bytes in a row that are no frame, before a TCP client is sent away."""
 _ACCEPT_AGAIN_NS = 1_000_000_000
@@ -161,7 +161,8 @@ class Outlet:
 class UdpOutlet(Outlet):
     """Commands and data over one UDP port; data go to where the start command came from.
 
-    UDP clients do not say good-bye: one that has started streams and vanished is sent to until it, or the run, stops.
+    A client is nothing but the streams it has started: it is forgotten with the last one it stops. UDP clients do not
+    say good-bye: one that has started streams and vanished is sent to until it, or the run, stops, or others need room.
     """
 
     def __init__(
@@ -173,6 +174,7 @@ class UdpOutlet(Outlet):
         self._outbox = Outbox(self._sock, stage.dirty)
         self._framer = Framer(streaming=False)
         self._clients: dict[str, _UdpClient] = {}
+        """By ``host:port``, the one heard longest ago first."""
         stage.reactor.watch(self._sock, READ, self._ready)
 
     def close(self) -> None:
@@ -192,22 +194,24 @@ class UdpOutlet(Outlet):
         self._outbox.flush()
 
     def _hear(self, chunk: Chunk) -> None:
-        client = self._clients.get(chunk.flow.source)
+        source = chunk.flow.source
         for item in self._framer.feed(chunk.data):
             if not isinstance(item, Frame):
                 continue
-            client = client or self._new_client(chunk.flow.source)
-            if client is not None and (answer := self._obey(client, item.data)) is not None:
+            client = self._clients.pop(source, None) or self._stranger(source)
+            if (answer := self._obey(client, item.data)) is not None:
                 self._outbox.put(answer, client.where, 0)
+            if client.role.started:
+                self._clients[source] = client
+        while len(self._clients) > MAX_CLIENTS:
+            oldest = self._clients.pop(next(iter(self._clients)))
+            self._forget(oldest)
+            self._tell(ServerKind.DISCONNECTED, oldest.address, f"heard longest ago of more than {MAX_CLIENTS} clients")
 
-    def _new_client(self, source: str) -> _UdpClient | None:
+    def _stranger(self, source: str) -> _UdpClient:
         host, _, port = source.rpartition(":")
         address = resolve(host.strip("[]"), int(port), datagram=True, family=self.address.family)
-        if len(self._clients) >= MAX_CLIENTS:
-            self._tell(ServerKind.TURNED_AWAY, address, f"{MAX_CLIENTS} clients are served already")
-            return None
-        client = self._clients[source] = _UdpClient(address, ServerRole(self.streams), source, self._outbox)
-        return client
+        return _UdpClient(address, ServerRole(self.streams), source, self._outbox)
 
 
 class TcpOutlet(Outlet):

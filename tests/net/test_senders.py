@@ -8,7 +8,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -343,13 +343,34 @@ def test_too_many_clients_are_turned_away(monkeypatch: pytest.MonkeyPatch) -> No
     with serving("tcp://127.0.0.1:0") as server, clients(server, 4) as joined:
         server.until(lambda: ServerKind.TURNED_AWAY in server.kinds())
         server.until(lambda: [client.hear() is not None and client.ended for client in joined] == [False] * 3 + [True])
+
+
+def test_at_the_limit_the_udp_client_heard_longest_ago_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet_module, "MAX_CLIENTS", 3)
+    with serving("udp+cmd://127.0.0.1:0") as server, ExitStack() as stack:
+        socks = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(4)]
+        for sock in (*socks[:3], socks[0], socks[3]):  # the first is heard again, so the second is the oldest
+            seen = len(server.events)
+            sock.sendto(START, server.address)
+            server.until(lambda seen=seen: len(server.events) > seen)  # type: ignore[misc]
+        assert server.kinds() == [Outcome.STARTED] * 5 + [ServerKind.DISCONNECTED]
+        assert server.events[-1].client == f"127.0.0.1:{socks[1].getsockname()[1]}"
+        assert server.senders.audience(server.handles[0]) == 3
+
+
+def test_udp_clients_that_have_started_nothing_take_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet_module, "MAX_CLIENTS", 1)
+    stop, ask = encode_command(7, Command.STOP_DATA), encode_command(7, Command.SEND_CFG2)
+    foreign = encode_command(8, Command.START_DATA)
     with serving("udp+cmd://127.0.0.1:0") as server:
-        for _ in range(4):
+        for said in [(START, stop), (ask,), (foreign,), (data_frame(CONFIG, 0),), (START, stop), (START,)]:
+            awaited = len(server.events) + len(said)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-                sock.sendto(START, server.address)
-                seen = len(server.events)
-                server.until(lambda seen=seen: len(server.events) > seen)  # type: ignore[misc]
-        assert server.kinds() == [Outcome.STARTED] * 3 + [ServerKind.TURNED_AWAY]
+                for frame in said:
+                    sock.sendto(frame, server.address)
+                server.until(lambda awaited=awaited: len(server.events) == awaited)  # type: ignore[misc]
+        assert ServerKind.DISCONNECTED not in server.kinds()
+        assert server.senders.audience(server.handles[0]) == 1
 
 
 def test_no_descriptor_left_is_told_and_tried_again_later(monkeypatch: pytest.MonkeyPatch) -> None:
