@@ -2,8 +2,9 @@
 
 Configurations are kept per flow and IDCODE. A data frame whose flow has shown none is matched to another flow from
 the same host (commands over TCP with data over UDP) if exactly one fits by IDCODE and size. Data that comes before
-its configuration is held, at most :data:`HELD_BYTES` a stream, and given out when a configuration of the right frame
-size comes; what is still held at the end, or overflows, becomes ``Skipped(NO_CONFIG)``.
+its configuration is held, at most :data:`HELD_BYTES` a stream and :data:`ALL_HELD_BYTES` in all, and given out when a
+configuration of the right frame size comes; what is still held at the end, or overflows, becomes
+``Skipped(NO_CONFIG)``: of one stream the newest frames, of all streams the one that has waited longest.
 
 A flow that never shows a good frame is not C37.118 traffic: its bytes are counted in ``ignored``, not skipped.
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from pmutools.c37118.config import StreamConfig, decode_config, decode_config_body
 from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
@@ -22,6 +23,7 @@ from pmutools.errors import WireError
 from pmutools.flow import Chunk, Flow
 
 HELD_BYTES = 4 << 20
+ALL_HELD_BYTES = 64 << 20
 FRAGMENT_BYTES = 1 << 20
 FLOWS = 1 << 16
 """Flows remembered at once; the oldest is ended when another comes (a flood of spoofed sources)."""
@@ -72,12 +74,21 @@ class Tally:
         self.fed += frames * size
 
 
+_T = TypeVar("_T")
 _Place = tuple[str, int]
 """A host and an IDCODE."""
 
 
 def _host(endpoint: str) -> str:
     return endpoint.rpartition(":")[0] or endpoint
+
+
+def _forget(table: dict[_Place, dict[Flow, _T]], place: _Place, flow: Flow) -> None:
+    """Take ``flow`` out, and with the last flow the place, so that a table is no larger than the flows there are."""
+    flows = table.get(place, {})
+    flows.pop(flow, None)
+    if not flows:
+        table.pop(place, None)
 
 
 @dataclass
@@ -113,6 +124,8 @@ class Demux:
         self._flows: dict[Flow, _FlowState] = {}
         self._configs: dict[_Place, dict[Flow, StreamConfig]] = {}
         self._waiting: dict[_Place, dict[Flow, _FlowState]] = {}
+        """Who holds data, the place that has waited longest first."""
+        self._held_bytes = 0
         self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
 
     def feed(self, chunk: Chunk) -> list[Message | Loss]:
@@ -161,17 +174,16 @@ class Demux:
     def held(self, flow: Flow) -> dict[int, int]:
         """Bytes of ``flow``'s data frames that wait for a fitting configuration, by IDCODE."""
         state = self._flows.get(flow)
-        return {idcode: held.nbytes for idcode, held in state.held.items() if held.nbytes} if state else {}
+        return {idcode: held.nbytes for idcode, held in state.held.items()} if state else {}
 
     def _end(self, state: _FlowState, out: list[Message | Loss]) -> None:
         for item in state.framer.close():
             self._take(state, item, out)
-        for idcode, held in state.held.items():
-            self._drop(state, held.frames, out)
-            self._waiting.get((state.host, idcode), {}).pop(state.flow, None)
+        for idcode in list(state.held):
+            self._give_up(state, idcode, out)
         for idcode in state.configs:
-            self._configs.get((state.host, idcode), {}).pop(state.flow, None)
-            self._borrowers.get((state.host, idcode), {}).pop(state.flow, None)
+            _forget(self._configs, (state.host, idcode), state.flow)
+            _forget(self._borrowers, (state.host, idcode), state.flow)
         if not state.proven and state.early_bytes:
             self.tally.ignored += state.early_bytes
             self.tally.ignored_flows += 1
@@ -256,9 +268,10 @@ class Demux:
         held = state.held[config.idcode]
         fitting = [frame for frame in held.frames if len(frame.data) == config.frame_size]
         held.frames = [frame for frame in held.frames if len(frame.data) != config.frame_size]
-        held.nbytes = sum(len(frame.data) for frame in held.frames)
+        held.nbytes -= len(fitting) * config.frame_size
+        self._held_bytes -= len(fitting) * config.frame_size
         if not held.frames:
-            del self._waiting[state.host, config.idcode][state.flow]
+            self._give_up(state, config.idcode, out)
         for frame in fitting:
             self._emit(Message(frame, state.flow, config), FrameType.DATA, out)
 
@@ -278,13 +291,26 @@ class Demux:
         return config
 
     def _hold(self, state: _FlowState, frame: Frame, out: list[Message | Loss]) -> None:
-        held = state.held.setdefault(frame.idcode, _Held())
-        self._waiting.setdefault((state.host, frame.idcode), {})[state.flow] = state
-        if held.nbytes + len(frame.data) > HELD_BYTES:
+        size = len(frame.data)
+        held = state.held.get(frame.idcode)
+        if held is not None and held.nbytes + size > HELD_BYTES:
             self._drop(state, [frame], out)
             return
+        while self._waiting and self._held_bytes + size > ALL_HELD_BYTES:
+            (_, idcode), flows = next(iter(self._waiting.items()))
+            self._give_up(next(iter(flows.values())), idcode, out)
+        held = state.held.setdefault(frame.idcode, _Held())
         held.frames.append(frame)
-        held.nbytes += len(frame.data)
+        held.nbytes += size
+        self._held_bytes += size
+        self._waiting.setdefault((state.host, frame.idcode), {})[state.flow] = state
+
+    def _give_up(self, state: _FlowState, idcode: int, out: list[Message | Loss]) -> None:
+        """Hold nothing of this stream any longer."""
+        held = state.held.pop(idcode)
+        self._held_bytes -= held.nbytes
+        _forget(self._waiting, (state.host, idcode), state.flow)
+        self._drop(state, held.frames, out)
 
     def _drop(self, state: _FlowState, frames: list[Frame], out: list[Message | Loss]) -> None:
         for frame in frames:

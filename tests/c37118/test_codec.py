@@ -27,9 +27,10 @@ from pmutools.c37118 import (
     encode_message,
     restamp,
 )
+from pmutools.c37118 import demux as demux_module
 from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.checksum import _plain_chk, chk
-from pmutools.c37118.framer import Frame
+from pmutools.c37118.framer import Frame, SkipReason
 from pmutools.errors import ChecksumError, ConfigError, EncodeError, LengthError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.tools.describe import describe
@@ -298,6 +299,42 @@ def test_unrelated_flows_are_ignored_not_skipped() -> None:
     feed(demux, Flow("tcp", "a:80", "b:99"), b"HTTP/1.1 200 OK", b"\xaa\x01 and so on")
     assert demux.close() == []
     assert (demux.tally.ignored, demux.tally.ignored_flows, demux.tally.skipped) == (27, 1, {})
+
+
+def test_flows_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demux_module, "FLOWS", 50)
+    streams = [random_stream(random.Random(k), stations=1, idcode=k) for k in range(1, 9)]
+    demux = Demux()
+    for number in range(3000):
+        stream, other = streams[number % 8], streams[(number + 1) % 8]
+        host = f"10.0.{number >> 8}.{number & 255}"
+        feed(demux, Flow("tcp", f"{host}:4712", "b:1"), stream.config(), other.data[0])
+        feed(demux, Flow("udp", f"{host}:4713", "b:2"), stream.data[0])  # borrows the other flow's configuration
+        tables = (demux._configs, demux._waiting, demux._borrowers)
+        assert all(len(table) <= 50 for table in tables)
+    demux.close()
+    assert tables == ({}, {}, {})
+    assert demux.tally.fed == demux.tally.framed + demux.tally.skipped_bytes
+
+
+def test_all_flows_share_one_budget_of_held_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = random_stream(random.Random(7), stations=1)
+    size = len(stream.data[0])
+    monkeypatch.setattr(demux_module, "ALL_HELD_BYTES", 2000 * size)
+    flows = [Flow("udp", f"10.1.{k >> 8}.{k & 255}:4713", "b:1") for k in range(3000)]
+    demux = Demux()
+    losses: list[Any] = []
+    for flow in flows:
+        losses += feed(demux, flow, stream.data[0])
+        assert demux.pending <= 2000 * size
+    assert [loss.flow for loss in losses] == flows[:1000]  # those that had waited longest
+    assert {loss.skipped.reason for loss in losses} == {SkipReason.NO_CONFIG}
+    items = feed(demux, flows[-1], stream.config())
+    assert [item.frame.data for item in items] == [stream.config(), stream.data[0]]
+    assert demux.pending == 1999 * size
+    assert feed(demux, flows[0], stream.data[1]) == []  # there is room again
+    demux.close()
+    assert demux.tally.fed == demux.tally.framed + demux.tally.skipped_bytes
 
 
 def test_changed_configuration_takes_over() -> None:
