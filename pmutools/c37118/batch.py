@@ -132,8 +132,14 @@ def decode_batch(
         rows = slice(first, first + step)
         if check:
             _check(wire[rows], config, first)
-        _fill(batch, rows)
+        with _quiet():
+            _fill(batch, rows)
     return batch
+
+
+def _quiet() -> np.errstate:
+    """The wire may hold any float, as a value or as a scale: what comes of it is infinity or NaN, and no news."""
+    return np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 def _check(wire: npt.NDArray[np.void], config: StreamConfig, first: int) -> None:
@@ -233,18 +239,17 @@ def _phasors(out: npt.NDArray[np.float64], raw: npt.NDArray[Any], slots: Sequenc
     turn = np.array([slot.angle_offset_rad for slot in slots])
     floating, first, second = slots[0].floating, raw[..., 0], raw[..., 1]
     if slots[0].polar:
-        with np.errstate(invalid="ignore"):  # an infinite angle or 0 * inf: NaN is the answer
-            if floating:
-                angle = second - turn
-                cosine, sine = np.cos(angle), np.sin(angle)
-            else:
-                unit = _unit_phasors().take(second)
-                if turn.any():
-                    unit *= np.exp(-1j * turn)
-                cosine, sine = unit.real, unit.imag
-            magnitude = first * factor
-            np.multiply(magnitude, cosine, out=out[..., 0])
-            np.multiply(magnitude, sine, out=out[..., 1])
+        if floating:
+            angle = second - turn
+            cosine, sine = np.cos(angle), np.sin(angle)
+        else:
+            unit = _unit_phasors().take(second)
+            if turn.any():
+                unit *= np.exp(-1j * turn)
+            cosine, sine = unit.real, unit.imag
+        magnitude = first * factor
+        np.multiply(magnitude, cosine, out=out[..., 0])
+        np.multiply(magnitude, sine, out=out[..., 1])
         return
     out[...] = raw
     if not floating:
@@ -271,7 +276,8 @@ def encode_batch(batch: Batch) -> tuple[npt.NDArray[np.uint8], int]:
     clipped = 0
     for first in range(0, count, step):
         rows = slice(first, first + step)
-        clipped += sum(_put(wire[rows], batch[rows], layout, run) for run in layout.runs)
+        with _quiet():
+            clipped += sum(_put(wire[rows], batch[rows], layout, run) for run in layout.runs)
         wire["chk"][rows] = chk_array(octets[rows, :-2])
     return octets, clipped
 
@@ -292,9 +298,8 @@ def _put(wire: npt.NDArray[np.void], batch: Batch, layout: Layout, run: Run) -> 
         clipped += _put_phasors(blocks["phasors"], batch.phasors[:, run.phasors], layout.phasors[run.phasors])
     if "analogs" in names:
         out, scales = blocks["analogs"], layout.analogs[run.analogs]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shifted = batch.analogs[:, run.analogs] - [scale.offset for scale in scales]
-            counts = (shifted / [scale.multiplier for scale in scales]).reshape(out.shape)
+        shifted = batch.analogs[:, run.analogs] - [scale.offset for scale in scales]
+        counts = (shifted / [scale.multiplier for scale in scales]).reshape(out.shape)
         if out.dtype.kind == "i":
             out[...], over = _int16(counts)
             clipped += over

@@ -30,7 +30,18 @@ from pmutools.c37118 import (
 from pmutools.c37118 import demux as demux_module
 from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.checksum import _plain_chk, chk
+from pmutools.c37118.config import (
+    AnalogChannel,
+    AnalogScale,
+    PhasorChannel,
+    PhasorScale,
+    Station,
+    StationDetails,
+    StreamConfig,
+)
+from pmutools.c37118.constants import Format
 from pmutools.c37118.framer import Frame, SkipReason
+from pmutools.c37118.frames import wire_values
 from pmutools.errors import ChecksumError, ConfigError, EncodeError, LengthError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.tools.describe import describe
@@ -259,6 +270,25 @@ def test_lying_configurations_raise_nothing_but_wire_errors(stream: Described, d
     except WireError:
         return
     assert encode_config(config)[14:-2] == sealed[14:-2]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("fmt", range(16))
+@pytest.mark.parametrize("odd", [math.inf, -math.inf, math.nan, 3e38, 0.0])
+def test_scales_that_are_no_numbers_give_nan_and_no_warning(fmt: int, odd: float) -> None:
+    """CFG-3 may say anything: the one way in and the other say the same of it, in silence."""
+    phasors = [
+        PhasorChannel("A", phscale=scale) for scale in (PhasorScale(0, 0, 0, 1, odd), PhasorScale(0, 0, 0, odd, 1))
+    ]
+    analogs = [AnalogChannel("X", anscale=scale) for scale in (AnalogScale(odd, 0), AnalogScale(1, odd))]
+    station = Station("S", 1, Format(fmt), tuple(phasors), tuple(analogs), details=StationDetails())
+    config = StreamConfig(1, (station,), 50, kind=FrameType.CFG3)
+    values = [0, *(3, 4, 5, 6), *(0, 0), *(7, 8)]
+    frame = encode_data(wire_values(config, (0xAA01, 0, 1, 0, 0, 0), [values]))
+    one, many = decode_data(frame, config).station(), decode_batch(frame, config)
+    np.testing.assert_allclose(many.phasors[0], one.phasors, rtol=1e-12)
+    np.testing.assert_allclose(many.analogs[0], one.analogs, rtol=1e-12)
+    assert encode_batch(many)[0].shape == (1, len(frame))
 
 
 # --- several flows ----------------------------------------------------------------------------------------------
