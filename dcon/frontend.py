@@ -30,10 +30,10 @@ class Binding:
         if len(frame.data) != self.layout.frame_size:
             return None
         data = unpack_data(frame.data, self.config, self.layout)
-        time_ns = data.time_ns
+        time_ns, arrival_ns = data.time_ns, frame.arrival_ns
         sample = Sample(
             time_ns,
-            time_ns if frame.arrival_ns is None else frame.arrival_ns,
+            time_ns if arrival_ns is None else arrival_ns,
             self.v1(data),
             data.frequency(self.station),
             data.stat(self.station),

@@ -10,7 +10,9 @@ from dcon.core.params import Pair, Params
 from dcon.core.state import Instance, Pmu
 from dcon.core.values import InstanceState
 
+_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time: there are many instances
 _S = InstanceState
+_INITIALISING: Final = InstanceState.INITIALISING  # looking a member up costs as much as comparing it
 TRANSITIONS: Final[dict[tuple[InstanceState, str], InstanceState]] = {
     (_S.DISABLED, "pair"): _S.INITIALISING,
     (_S.INITIALISING, "verified"): _S.READY,
@@ -75,11 +77,11 @@ def update(
     new_frames = 1 if last.slot is None else slot - last.slot
     verified = last.verified + max(new_frames, 0)
     state = TRANSITIONS.get((last.state, "pair"), last.state)
-    if state is InstanceState.INITIALISING and verified >= params.init_frames:
+    if state is _INITIALISING and verified >= params.init_frames:
         state = TRANSITIONS[state, "verified"]
     else:
         state = TRANSITIONS.get((state, "new" if new_frames > 0 else "hold"), state)
-    return Instance(state, verified, slot, delta_f_mhz, last.reason, raised)
+    return _new(Instance, (state, verified, slot, delta_f_mhz, last.reason, raised))
 
 
 def choose(params: Params, instances: Sequence[Instance], active: int | None, keep: bool) -> int | None:

@@ -32,6 +32,8 @@ from dcon.core.system import (
 from dcon.core.values import Event, Inputs, InstanceRecord, InstanceState, Mode, Order, Record, SystemState
 
 _SYSTEM = "system"
+_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time: there are many instances
+_DISABLED = InstanceState.DISABLED  # looking a member up costs as much as comparing it
 
 
 def step(
@@ -63,7 +65,7 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
     if active != state.active and active is not None:
         events.append(Event("selected", params.instance_names[active]))
     gain = approach(state.gain_mw_per_mhz, state.target_gain_mw_per_mhz, params.gain_ramp_per_s / params.tick_hz)
-    own_mw = tuple(_own_mw(params, instance, gain) for instance in instances)
+    own_mw = _own_mw(params, instances, gain)
 
     followed = None if active is None else instances[active]
     view = ArmView(ready, 0.0 if active is None else own_mw[active])
@@ -114,10 +116,13 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
     return after, _record(params, after, own_mw, events, now_ns)
 
 
-def _own_mw(params: Params, instance: Instance, gain: float) -> float:
-    if instance.state is InstanceState.DISABLED:
-        return 0.0
-    return command_mw(instance.delta_f_mhz, gain, params.deadband_mhz, params.limit_mw)
+def _own_mw(params: Params, instances: Sequence[Instance], gain: float) -> list[float]:
+    """What each instance alone would command."""
+    deadband_mhz, limit_mw = params.deadband_mhz, params.limit_mw
+    return [
+        0.0 if instance.state is _DISABLED else command_mw(instance.delta_f_mhz, gain, deadband_mhz, limit_mw)
+        for instance in instances
+    ]
 
 
 def _is_stop(order: Order) -> bool:
@@ -223,7 +228,7 @@ def _record(params: Params, state: State, own_mw: Sequence[float], events: Seque
         f_hz=tuple(params.nominal_hz + pmu.ring[0] if pmu.ring else math.nan for pmu in state.pmus),
         age_ms=tuple(math.nan if pmu.arrival_ns is None else (now_ns - pmu.time_ns) / 1e6 for pmu in state.pmus),
         instances=tuple(
-            InstanceRecord(instance.state, index == active, instance.delta_f_mhz, mw, instance.reason)
+            _new(InstanceRecord, (instance.state, index == active, instance.delta_f_mhz, mw, instance.reason))
             for index, (instance, mw) in enumerate(zip(state.instances, own_mw, strict=True))
         ),
         events=tuple(events),

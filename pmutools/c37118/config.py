@@ -160,6 +160,10 @@ class StreamConfig:
         return _encode_body(self)
 
     @cached_property
+    def _hash(self) -> int:  # decoding looks its layout up by it, frame by frame
+        return hash(self._key)
+
+    @cached_property
     def _key(self) -> tuple[int, int, bytes]:
         return self.kind, self.idcode, self.body
 
@@ -167,7 +171,7 @@ class StreamConfig:
         return self is other or (isinstance(other, StreamConfig) and self._key == other._key)
 
     def __hash__(self) -> int:
-        return hash(self._key)
+        return self._hash
 
 
 def decode_config(frame: bytes) -> tuple[Prefix, StreamConfig]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import cmath
+import struct
+from cmath import polar
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -37,8 +38,9 @@ class EmulatedStream:
         )
 
     @cached_property
-    def _pack(self) -> tuple[int, ...]:
-        return FrameType.DATA.sync, self.config.frame_size, self.config.idcode
+    def _packing(self) -> tuple[struct.Struct, tuple[int, ...]]:
+        head = FrameType.DATA.sync, self.config.frame_size, self.config.idcode
+        return layout_of(self.config).unpacker, head
 
     def config_frame(self, time_ns: int) -> bytes:
         """CFG-2, sent at ``time_ns``."""
@@ -49,10 +51,10 @@ class EmulatedStream:
         """The frame of one reporting instant, one measurement a PMU."""
         values: list[float] = []
         for report in measurements:
-            values.append(0)
-            for phasor in (report.va, report.vb, report.vc, report.v1, report.i1):
-                values += (abs(phasor), cmath.phase(phasor))
-            values += (report.frequency_hz, report.rocof_hz_s)
+            _, _, va, vb, vc, v1, i1, frequency_hz, rocof_hz_s = report
+            phasors = (*polar(va), *polar(vb), *polar(vc), *polar(v1), *polar(i1))
+            values += (0, *phasors, frequency_hz, rocof_hz_s)
         soc, fracsec = timebase.from_ns(measurements[0].time_ns, self.config.time_base)
-        frame = layout_of(self.config).unpacker.pack(*self._pack, soc, fracsec, *values, 0)[:-2]
+        packer, head = self._packing
+        frame = packer.pack(*head, soc, fracsec, *values, 0)[:-2]
         return frame + chk(frame).to_bytes(2, "big")

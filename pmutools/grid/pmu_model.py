@@ -89,7 +89,7 @@ def measure(
         delay_ms += pmu.delay.sd_ms * normal(*key, _DELAY)
     delay_ms = max(pmu.delay.low_ms, min(pmu.delay.high_ms, delay_ms))
     v1 = cmath.rect(magnitude, angle)
-    va, vb, vc = (v1 * turn for turn in _ROTATE)
+    va, vb, vc = v1 * _ROTATE[0], v1 * _ROTATE[1], v1 * _ROTATE[2]
     return Measurement(
         time_ns=time_ns,
         departure_ns=time_ns + round(delay_ms * 1e6),
