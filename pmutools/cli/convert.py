@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+from typing import TYPE_CHECKING
 
 import click
 
 from pmutools.cli.shell import Exit, Talk, common
-from pmutools.cli.sources import DURATION, parse_idcodes
+from pmutools.cli.sources import DURATION, END, IDCODES, START, spare
+
+if TYPE_CHECKING:
+    from pmutools.tools.window import Moment
 
 
 @click.command(name="convert", short_help="Recordings to another format.")
 @click.argument("inputs", nargs=-1, required=True, metavar="IN...")
 @click.argument("output", metavar="OUT")
-@click.option("--start", metavar="T", help="From T: seconds into the source, or ISO-8601 UTC.")
-@click.option("--end", metavar="T", help="Up to T, exclusive.")
-@click.option("--idcode", "idcodes", multiple=True, metavar="N", help="Only this stream; repeatable.")
+@START
+@END
+@IDCODES
 @click.option("--phasors", type=click.Choice(("polar", "rect")), default="polar", show_default=True)
 @click.option("--long", "long_form", is_flag=True, help="Tables in long form: one row a value, one file.")
 @DURATION
@@ -23,9 +27,9 @@ from pmutools.cli.sources import DURATION, parse_idcodes
 def command(
     inputs: tuple[str, ...],
     output: str,
-    start: str | None,
-    end: str | None,
-    idcodes: tuple[str, ...],
+    start: Moment | None,
+    end: Moment | None,
+    idcodes: tuple[int, ...],
     phasors: str,
     long_form: bool,
     duration_ns: int | None,
@@ -40,15 +44,11 @@ def command(
     from pmutools.formats import open_sink
     from pmutools.tools.convert import convert
     from pmutools.tools.recordings import open_recordings
-    from pmutools.tools.window import Window, parse_moment
+    from pmutools.tools.window import Window
 
     talk = Talk(quiet, verbose)
-    window = Window(
-        parse_moment(start) if start else None,
-        parse_moment(end) if end else None,
-        duration_ns,
-        parse_idcodes(idcodes),
-    )
+    spare(output, inputs)
+    window = Window(start, end, duration_ns, idcodes)
     source = open_recordings(inputs)
     with open_sink(output, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
         result = convert(source, sink, window)

@@ -13,12 +13,13 @@ import click
 
 from pmutools import parsers
 from pmutools.cli.shell import Exit, F, Parsed, Talk, common, interruptible
-from pmutools.cli.sources import DURATION
+from pmutools.cli.sources import DURATION, END, START, spare
 from pmutools.errors import SettingsError
 
 if TYPE_CHECKING:
     from pmutools.impair.profile import Profile
     from pmutools.tools.player.play import StreamResult
+    from pmutools.tools.window import Moment
 
 MS = 1_000_000
 FAULTS = ("loss", "delay", "drop", "duplicate", "reorder", "corrupt", "disable")
@@ -45,8 +46,8 @@ def _speed(text: str) -> Fraction:
     "--interval", "interval_ns", type=Parsed(parsers.duration_ns(MS, 0.001)), metavar="MS", help="Send spacing only."
 )
 @click.option("--loop", "loops", type=click.IntRange(0), default=1, show_default=True, help="0: for ever.")
-@click.option("--start", metavar="T", help="From T: seconds into the source, or UTC.")
-@click.option("--end", metavar="T", help="Up to T, exclusive.")
+@START
+@END
 @click.option("--select", multiple=True, metavar="NAME|IDCODE", help="Only this stream; repeatable.")
 @click.option("--exclude", multiple=True, metavar="NAME|IDCODE", help="Not this stream; repeatable.")
 @click.option(
@@ -80,8 +81,8 @@ def command(
     fps: int | None,
     interval_ns: int | None,
     loops: int,
-    start: str | None,
-    end: str | None,
+    start: Moment | None,
+    end: Moment | None,
     select: tuple[str, ...],
     exclude: tuple[str, ...],
     cfg_period_ns: int,
@@ -106,7 +107,7 @@ def command(
     from pmutools.tools.player.script import study
     from pmutools.tools.player.stamps import StampPolicy
     from pmutools.tools.recordings import losses, open_recordings
-    from pmutools.tools.window import Window, parse_moment
+    from pmutools.tools.window import Window
 
     talk = Talk(quiet, verbose)
     if not to and not listen:
@@ -128,9 +129,10 @@ def command(
         seed=seed,
         duration_ns=duration_ns,
     )
-    window = Window(parse_moment(start) if start else None, parse_moment(end) if end else None)
+    if ledger is not None:
+        spare(ledger, files)
     source = open_recordings(files)
-    script = study(source.items(), timing, window, select, exclude)
+    script = study(source.items(), timing, Window(start, end), select, exclude)
     lost = losses(source)
     for pattern in options.profile.unmatched(stream.names for stream in script.streams):
         talk.say(f"no stream is called {pattern!r}; there are {', '.join(stream.name for stream in script.streams)}")

@@ -157,15 +157,24 @@ def run(command: click.Command, arguments: Sequence[str], *, name: str | None = 
         return int(code or 0)
     except (KeyboardInterrupt, click.Abort):
         return Exit.INTERRUPTED
-    except BrokenPipeError:  # `pmu dump ... | head`: the reader has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return Exit.DONE
+    except BrokenPipeError:
+        return _unread()
+    except SystemExit as end:  # so click and rich say that a pipe is broken
+        if not isinstance(end.__context__, BrokenPipeError):
+            raise
+        return _unread()
     except Exception as error:
         if "--debug" in arguments:
             traceback.print_exc()
         code, text = _judged(error, name)
         click.echo(text, err=True)
         return code
+
+
+def _unread() -> int:
+    """``pmu dump ... | head``: the reader has seen enough."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return Exit.DONE
 
 
 def _judged(error: Exception, name: str) -> tuple[Exit, str]:
@@ -185,7 +194,7 @@ def _judged(error: Exception, name: str) -> tuple[Exit, str]:
         case PmuError():
             return Exit.FAILED, _line(name, error)
         case OSError():
-            return Exit.FAILED, _line(name, f"{error.filename}: {error.strerror}" if error.filename else error)
+            return Exit.FAILED, _line(name, f"{error.filename or 'standard output'}: {error.strerror or error}")
     what = f"internal error: {type(error).__name__}: {error} (--debug shows where)"
     return Exit.FAILED, _line(name, what)
 

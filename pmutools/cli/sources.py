@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,10 +17,30 @@ from pmutools.timebase import NS
 if TYPE_CHECKING:
     from pmutools.c37118.demux import Loss, Message
     from pmutools.formats.source import Block, Source
+    from pmutools.tools.window import Moment
 
 TARGET = str
 """A path, or an endpoint URL."""
 
+
+def _moment(text: str) -> Moment:
+    from pmutools.tools.window import parse_moment
+
+    return parse_moment(text)
+
+
+IDCODES = click.option(
+    "--idcode",
+    "idcodes",
+    type=Parsed(parsers.integer(0, 0xFFFF)),
+    multiple=True,
+    metavar="N",
+    help="Only this stream; repeatable.",
+)
+START = click.option(
+    "--start", type=Parsed(_moment), metavar="T", help="From T: seconds into the source, or ISO-8601 UTC."
+)
+END = click.option("--end", type=Parsed(_moment), metavar="T", help="Up to T, exclusive.")
 DURATION = click.option(
     "--duration",
     "duration_ns",
@@ -64,12 +85,8 @@ class _Cut:
         return Window(duration_ns=self._duration_ns).blocks(self._source.blocks())
 
 
-def parse_idcodes(values: tuple[str, ...]) -> frozenset[int]:
-    """IDCODEs as given on a command line."""
-    try:
-        codes = frozenset(int(value, 0) for value in values)
-    except ValueError as error:
-        raise SettingsError(f"--idcode: {error}; give a number from 1 to 65534") from None
-    if bad := [code for code in codes if not 0 <= code <= 0xFFFF]:
-        raise SettingsError(f"--idcode {bad[0]}: an IDCODE is a number from 1 to 65534")
-    return codes
+def spare(output: str | Path, inputs: Sequence[str]) -> None:
+    """Raise SettingsError if ``output`` is one of the inputs, which opening it for writing would destroy."""
+    out = Path(output)
+    if out.exists() and any(Path(name).exists() and out.samefile(name) for name in inputs):
+        raise SettingsError(f"{output} is an input, and would be overwritten; write to another file")

@@ -101,6 +101,8 @@ class OutputFile(io.RawIOBase):
         try:
             yield
         except OSError as error:
+            if self.path == STDOUT and isinstance(error, BrokenPipeError):  # its reader has seen enough
+                raise
             raise SourceError(
                 f"cannot write {self.path}: {error.strerror or error}; check the folder and the space left"
             ) from None

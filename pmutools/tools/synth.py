@@ -15,12 +15,16 @@ from pmutools.flow import Flow, StampSource
 from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.grid import Grid
 from pmutools.grid.plant import build
-from pmutools.grid.pmu_model import TABLE_I_DELAY, PmuModel, fleet, measure
+from pmutools.grid.pmu_model import PmuModel, fleet, measure
 from pmutools.grid.scenarios import scenario
+from pmutools.impair.pipeline import Pipeline
+from pmutools.impair.profile import parse_profile
+from pmutools.impair.profiles import ready_profile
 
 START_NS = timebase.parse_utc("2024-01-01T00:00:00Z")
-NETWORK_NS = 16_000_000
-"""Table I's mean communication delay; the PMU's own is drawn from Table I."""
+DELAYS = "table1"
+"""The ready profile that frames go through from the stamp to the recorder, in order."""
+_IN_ORDER = "[stream *]\ndelay = +constant(0) order=keep\n"
 FIRST_PORT = 4801
 NOISE_RAD = 1e-4
 
@@ -42,7 +46,7 @@ class Recipe:
 
 def fleet_of(count: int, seed: int) -> tuple[PmuModel, ...]:
     """``count`` PMUs, shared between north and south, the north's first."""
-    models = fleet((count + 1) // 2, noise_rad=NOISE_RAD, delay=TABLE_I_DELAY, seed=seed)
+    models = fleet((count + 1) // 2, noise_rad=NOISE_RAD, seed=seed)
     north, south = models[: len(models) // 2], models[len(models) // 2 :]
     return (*north, *south[: count - len(north)])
 
@@ -55,6 +59,8 @@ def synthesise(recipe: Recipe) -> Iterator[Message]:
     groups = [pmus] if recipe.pdc_idcode is not None else [(pmu,) for pmu in pmus]
     streams = [EmulatedStream(group, recipe.rate, idcode=recipe.pdc_idcode) for group in groups]
     flows = [_flow(number) for number in range(len(streams))]
+    profile = ready_profile(DELAYS).then(parse_profile(_IN_ORDER, "order"))
+    links = [[Pipeline(profile, pmu.name, recipe.seed) for pmu in stream.pmus] for stream in streams]
     duration_s = course.duration_s if recipe.duration_s is None else recipe.duration_s
     for stream, flow in zip(streams, flows, strict=True):
         opening = stream.config_frame(recipe.start_ns)
@@ -65,10 +71,12 @@ def synthesise(recipe: Recipe) -> Iterator[Message]:
         yield from _due(waiting, time_ns)
         grid.advance(time_ns)
         buses = grid.buses()
-        for stream, flow in zip(streams, flows, strict=True):
+        for stream, flow, ways in zip(streams, flows, links, strict=True):
             reports = [measure(pmu, buses, time_ns, slot, nominal_hz=stream.nominal_hz) for pmu in stream.pmus]
-            arrival_ns = max(report.departure_ns for report in reports) + NETWORK_NS
-            frame = Frame(stream.data_frame(reports), arrival_ns, StampSource.CAPTURE, 0)
+            data = stream.data_frame(reports)
+            delayed = [out for way in ways for out in way.apply(slot, data, time_ns)]
+            arrival_ns = max(out.offset_ns for out in delayed)  # a concentrator waits for its slowest PMU
+            frame = Frame(data, arrival_ns, StampSource.CAPTURE, 0)
             waiting.append(Message(frame, flow, stream.config))
     yield from _due(waiting, 1 << 63)
 

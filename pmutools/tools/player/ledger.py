@@ -6,7 +6,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from pmutools.errors import SourceError
+from pmutools.formats.files import OutputFile
 from pmutools.impair.outgoing import LedgerRow
 
 if TYPE_CHECKING:
@@ -23,13 +23,10 @@ class LedgerWriter:
     def __init__(self, path: Path) -> None:
         import pyarrow.parquet as pq
 
-        self.path = path
         self._schema = _schema()
         self._rows: list[LedgerRow] = []
-        try:
-            self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
-        except OSError as error:
-            raise SourceError(f"cannot write {path}: {error.strerror or error}") from None
+        self._file = OutputFile(path)
+        self._writer = pq.ParquetWriter(self._file, self._schema, compression="zstd")
 
     def add(self, row: LedgerRow) -> None:
         self._rows.append(row)
@@ -37,8 +34,11 @@ class LedgerWriter:
             self._write()
 
     def close(self) -> None:
-        self._write()
-        self._writer.close()
+        try:
+            self._write()
+            self._writer.close()
+        finally:
+            self._file.close()
 
     def __enter__(self) -> LedgerWriter:
         return self
@@ -53,13 +53,10 @@ class LedgerWriter:
 
         if not self._rows:
             return
-        columns = [list(column) for column in zip(*self._rows, strict=True)]
+        rows, self._rows = self._rows, []
+        columns = [list(column) for column in zip(*rows, strict=True)]
         arrays: list[Any] = [pa.array(c, type=f.type) for c, f in zip(columns, self._schema, strict=True)]
-        try:
-            self._writer.write_table(pa.table(arrays, schema=self._schema))
-        except OSError as error:
-            raise SourceError(f"cannot write {self.path}: {error.strerror or error}") from None
-        self._rows = []
+        self._writer.write_table(pa.table(arrays, schema=self._schema))
 
 
 def _schema() -> pa.Schema:

@@ -1,0 +1,5 @@
+"""``python -m pmutools.cli``."""
+
+from pmutools.cli import main
+
+main()
