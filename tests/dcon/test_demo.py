@@ -220,8 +220,10 @@ def test_a_child_that_fails_is_told_and_the_other_is_ended(
     monkeypatch.setattr(conductor, "_launch", launched)
     monkeypatch.setattr(conductor, "_grid", lambda *args: failing if who == "grid" else LONG)
     monkeypatch.setattr(conductor, "_controller", lambda *args: failing if who == "controller" else LONG)
+    began = time.monotonic()
     with pytest.raises(DemoError, match=rf"^the {who} process failed: .*{said}$"):
         perform(Demo(tmp_path, course=SHORT))
+    assert time.monotonic() - began < 4  # it was asked to end, not waited for
     assert len(started) == 2 and all(process.poll() is not None for process in started)
 
 

@@ -115,13 +115,14 @@ def test_a_change_that_moves_nothing_is_an_event_and_no_more() -> None:
 def test_a_change_that_moves_channels_starts_the_pmu_again() -> None:
     bench = Bench(("N1", "N2", "S1"))
     bench.run(60)
-    config = bench.streams.streams["N1"].config
-    assert bench.engine.reconfigure("N1", station(config, phasors=config.stations[0].phasors[::-1])) is None
+    assert bench.engine.reconfigure("N1", bench.streams.slim("N1")) is None
     record = bench.tick()
     assert names(record)[0] == "config_changed N1"
     assert record.instances[0].state is InstanceState.DISABLED  # N1-S1, until it has been verified anew
     assert record.instances[1].state is InstanceState.READY  # N2-S1
     assert "selected N2-S1" in names(record)
+    later = bench.run(40)
+    assert bench.engine.unread == {} and later[-1].instances[0].state is InstanceState.READY
 
 
 def test_an_unusable_configuration_costs_the_pmu_until_a_good_one_comes() -> None:

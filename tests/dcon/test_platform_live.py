@@ -61,7 +61,7 @@ class Session:
     def start(self, start_ns: int, *arguments: str, ini: str | None = None) -> None:
         urls = [f"udp://127.0.0.1:{self.ports[name]}" for name in self.names]
         extra = f"\n[output]\nurl = udp://127.0.0.1:{self.gateway.port}\n[platform]\nfifo = no\n"
-        text = Streams(self.names).ini(urls=urls, extra=extra).replace("VA,VB,VC", "V1") if ini is None else ini
+        text = Streams(self.names).ini(urls=urls, extra=extra) if ini is None else ini
         (self.folder / "dcon.ini").write_text(text)
         self.gateway.start()
         command = [sys.executable, "-m", "dcon.cli", "platform", "--ini", str(self.folder / "dcon.ini"), "--json"]
@@ -105,7 +105,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sessions]:
     for names in (FOUR, TWO, TWO, TWO, TWO):
         folder = tmp_path_factory.mktemp("live")
         made.append(Session(folder, names, {name: free_udp_port() for name in names}))
-    start_ns = (time.time_ns() // NS + 3) * NS
+    start_ns = (time.time_ns() // NS + 4) * NS  # time to start five interpreters, on a busy machine too
     signal_s = (peak_after(start_ns + round((3.3 - SEEN_S) * NS)) - start_ns) / NS + SEEN_S
     told = Sessions(start_ns, signal_s, *made)
     sixty = {name: [each.ports[name] for each in made[:4] if name in each.ports] for name in FOUR}
@@ -175,7 +175,7 @@ def test_ticks_are_consecutive_at_their_phase(sessions: Sessions) -> None:
     assert all(abs(number - round(number / NS) * NS) <= 60 for number in numbers)
     assert [round((b - a) / NS) for a, b in pairwise(numbers)] == [1] * (len(ticks) - 1)
     assert ticks[-1].record.tick_ns <= sessions.start_ns + round(END_S * NS)
-    assert len(ticks) >= END_S * 60 - 1
+    assert ticks[0].record.tick_ns < sessions.start_ns + 1.5 * NS and len(ticks) > (END_S - 1.5) * 60
     late_us = [tick.timing.late_us for tick in ticks if tick.timing is not None]
     compute_us = [tick.timing.compute_us for tick in ticks if tick.timing is not None]
     assert len(late_us) == len(ticks)
@@ -200,7 +200,7 @@ def test_frames_are_those_that_were_sent(sessions: Sessions) -> None:
     frames = [frame for tick in sessions.whole.ticks() for frame in tick.frames]
     for name in FOUR:
         own = [frame for frame in frames if frame.name == name]
-        assert len(own) > 60 * END_S
+        assert len(own) > 60 * (END_S - 1.5)
         delays_ms = [((frame.arrival_ns or 0) - frame.time_ns) / 1e6 for frame in own]
         assert min(delays_ms) >= 40 and statistics.median(delays_ms) < 60
         assert {str(frame.stamp_source) for frame in own} <= {"kernel", "user"}

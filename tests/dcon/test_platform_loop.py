@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -369,17 +368,34 @@ def test_once_an_instance_is_ready_a_wrong_stream_costs_no_control(
 
 
 def test_a_configuration_that_changes_is_an_event_and_switches_bumplessly(bench: Make) -> None:
-    config = STREAMS.streams["N1"].config
-    station = config.stations[0]
-    changed = replace(config, stations=(replace(station, phasors=station.phasors[::-1], cfgcnt=1),))
-    made = bench([*stream(5), config_chunk("N1", START_NS + 2 * NS, changed)])
+    slim = Streams(("N1",))
+    config, first = slim.slim("N1"), 2 * 60
+    until_ns = START_NS + 2 * NS + 59 * MS  # the last frame before has come, the first of the new ones has not
+    items = [(at, item) for at, item in stream(5) if item.flow != FLOWS["N1"] or at < until_ns]
+    items.append(config_chunk("N1", until_ns, config))
+    for slot in range(first, 5 * 60):
+        arrival_ns = START_NS + slot * NS // 60 + 60 * MS
+        items.append((arrival_ns, Chunk(slim.frame("N1", slot).data, arrival_ns, FLOWS["N1"], StampSource.KERNEL)))
+    made = bench(items)
     made.run(4)
     switched = [record for record in made.records if any(event.name == "config_changed" for event in record.events)]
     assert len(switched) == 1
     assert switched[0].active == 1  # N2-S1
     assert switched[0].state is SystemState.ACTIVE
+    assert made.platform.engine.unread == {}
     assert max(made.steps_mw()) <= SLEW_MW_PER_S / 60 + 1e-9
     ended_well(made)
+
+
+def test_arrivals_stamped_by_a_wrong_clock_are_not_kept_for_ever(bench: Make) -> None:
+    """An arrival an hour from now is a clock's mistake: the frame is taken, and the check on latency is for it."""
+    items = stream(2)
+    wrong = [(at, item._replace(arrival_ns=at + 3600 * NS) if isinstance(item, Chunk) else item) for at, item in items]
+    made = bench(wrong)
+    summary = made.run(2, orders=())
+    assert summary.frames > 300
+    assert sum(map(len, made.platform._frames.values())) == 0
+    assert made.records[-1].instances[0].reason.count("latency") >= 1
 
 
 def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pytest.LogCaptureFixture) -> None:

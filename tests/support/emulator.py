@@ -5,19 +5,15 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from types import TracebackType
 
 from support.swing import MS, Streams
 
 from dcon.drivers.udp_command import CommandOut, decode
-from pmutools.c37118 import FrameType, Prefix, decode_data, encode_data
-from pmutools.c37118.frames import wire_values
 from pmutools.c37118.session import served
 from pmutools.clock import SystemClock, utc_offset
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.server import Senders
-from pmutools.timebase import from_ns
 
 AGE_MS = 40
 """Of a frame when it leaves."""
@@ -29,9 +25,8 @@ class Emulator(threading.Thread):
     def __init__(self, ports: Mapping[str, Sequence[int]], *, rate: int = 60) -> None:
         super().__init__(daemon=True)
         self.streams = Streams(tuple(ports), rate)
-        self.configs = {name: stream.config for name, stream in self.streams.streams.items()}
         self.senders = Senders(SystemClock(), cfg_period_ns=None)
-        self.handles = {name: self.senders.add(served(config)) for name, config in self.configs.items()}
+        self.handles = {name: self.senders.add(served(config)) for name, config in self.streams.configs.items()}
         for name, numbers in ports.items():
             for port in numbers:
                 self.senders.send_to(parse_endpoint(f"udp://127.0.0.1:{port}"), [self.handles[name]])
@@ -39,7 +34,7 @@ class Emulator(threading.Thread):
         self._over = threading.Event()
 
     def slim(self, name: str) -> None:
-        """From the next frame on, ``name`` sends V1 only, under a new configuration."""
+        """From the next frame on, ``name`` sends its voltages only, under a new configuration."""
         self._slimmed.append(name)
 
     def run(self) -> None:
@@ -53,30 +48,14 @@ class Emulator(threading.Thread):
             stamp_ns = self.streams.stamp_ns(slot, 0)
             self.senders.serve_until(offset.monotonic_ns(stamp_ns + AGE_MS * MS))
             while self._slimmed:
-                self._slim(self._slimmed.pop())
+                name = self._slimmed.pop()
+                self.senders.replace(self.handles[name], served(self.streams.slim(name)))
                 announced = 0
             if slot > announced + rate:
                 self.senders.announce()
                 announced = slot
-            self.senders.publish([(handle, self._frame(name, stamp_ns)) for name, handle in self.handles.items()])
+            self.senders.publish([(h, self.streams.data(name, stamp_ns)) for name, h in self.handles.items()])
         self.senders.close()
-
-    def _slim(self, name: str) -> None:
-        config = self.configs[name]
-        station = config.stations[0]
-        v1 = tuple(channel for channel in station.phasors if channel.name == "V1")
-        self.configs[name] = replace(config, stations=(replace(station, phasors=v1, cfgcnt=station.cfgcnt + 1),))
-        self.senders.replace(self.handles[name], served(self.configs[name]))
-
-    def _frame(self, name: str, stamp_ns: int) -> bytes:
-        frame = self.streams.data(name, stamp_ns)
-        config, first = self.configs[name], self.streams.streams[name].config
-        if config is first:
-            return frame
-        values = decode_data(frame, first).values
-        soc, fracsec = from_ns(stamp_ns, config.time_base)
-        prefix = Prefix(FrameType.DATA.sync, config.frame_size, config.idcode, soc, 0, fracsec)
-        return encode_data(wire_values(config, prefix, [[values[5], *values[12:14], *values[16:18]]]))
 
     def close(self) -> None:
         self._over.set()

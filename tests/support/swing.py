@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from dcon.settings import Settings, parse
 from dcon.sim.plan import ini_of
-from pmutools.c37118 import Frame
+from pmutools.c37118 import Frame, StreamConfig, decode_data, decode_prefix, encode_data
+from pmutools.c37118.frames import wire_values
 from pmutools.flow import StampSource
 from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.pmu_model import PmuModel, fleet, measure
@@ -48,14 +50,30 @@ class Streams:
         self.pmus = some(names)
         self.rate = rate
         self.streams = {pmu.name: EmulatedStream([pmu], rate) for pmu in self.pmus}
+        self.configs = {name: stream.config for name, stream in self.streams.items()}
+        """In force."""
 
     def stamp_ns(self, slot: int, start_ns: int = START_NS) -> int:
         return start_ns + (slot * NS + self.rate // 2) // self.rate
 
+    def slim(self, name: str) -> StreamConfig:
+        """From now on ``name`` sends its voltages only, under the configuration returned."""
+        config = self.configs[name]
+        station = config.stations[0]
+        voltages = tuple(channel for channel in station.phasors if channel.kind == "V")
+        changed = replace(station, phasors=voltages, cfgcnt=station.cfgcnt + 1)
+        self.configs[name] = replace(config, stations=(changed,))
+        return self.configs[name]
+
     def data(self, name: str, stamp_ns: int) -> bytes:
-        stream = self.streams[name]
+        stream, config = self.streams[name], self.configs[name]
         report = measure(stream.pmus[0], buses(stamp_ns), stamp_ns, 0, nominal_hz=stream.nominal_hz)
-        return stream.data_frame([report])
+        frame = stream.data_frame([report])
+        if config is stream.config:
+            return frame
+        prefix, values = decode_prefix(frame), decode_data(frame, stream.config).values
+        voltages = values[6 : 6 + 2 * len(config.stations[0].phasors)]
+        return encode_data(wire_values(config, prefix, [[values[5], *voltages, *values[-3:-1]]]))
 
     def frame(self, name: str, slot: int, delay_ms: float = 60.0) -> Frame:
         stamp_ns = self.stamp_ns(slot)
