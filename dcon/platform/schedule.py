@@ -16,7 +16,7 @@ class TickGrid(NamedTuple):
 
     def after(self, time_ns: int) -> int:
         """Index of the first tick later than ``time_ns``."""
-        index = timebase.slot(time_ns - self.phase_ns, Fraction(self.rate_hz)) - 1
+        index = timebase.slot(time_ns - self.phase_ns, Fraction(self.rate_hz))
         while self.time_ns(index) <= time_ns:
             index += 1
         return index

@@ -49,6 +49,7 @@ def test_a_course_is_in_order(course: Course) -> None:
     ]
     assert course.init_s < ordered[0] < course.open_loop_s < course.arm_s < course.closed_loop_s < course.disarm_s
     assert course.disarm_s < course.end_s == course.scenario.duration_s
+    assert ordered[5] + 1 < course.closed_loop_s  # the transfer is over when the second brake comes
     assert [(pulse.start_s, pulse.stop_s) for pulse in course.scenario.pulses] == [
         (at, at + BRAKE_S) for at in (course.open_loop_s, course.closed_loop_s)
     ]
@@ -104,6 +105,10 @@ def test_a_swing_is_judged_from_the_log_alone(closed: Path) -> None:
         assert swing.frequency_hz == pytest.approx(0.435, abs=0.004)
         assert swing.damping_percent == pytest.approx(11.3, abs=0.5)
         assert swing.r2 > 0.98
+        start_s, stop_s = SHORT.judged(brake_s)
+        outside = (traces.time_s < start_s) | (traces.time_s >= stop_s)
+        wild = replace(traces, delta_f_mhz=np.where(outside, 1e3 * np.sin(traces.time_s * 9), traces.delta_f_mhz))
+        assert judge(wild, SHORT, brake_s) == swing
 
 
 def test_a_session_that_ended_early_is_not_judged(closed: Path) -> None:
