@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = [
     # ground floor, lowest first
-    ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase"],
+    ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws"],
     ["pmutools.linux", "pmutools.parsers"],
     ["pmutools.clock", "pmutools.settings"],
     ["pmutools.pacing"],

@@ -51,7 +51,7 @@ class EmulatedStream:
         """The frame of one reporting instant, one measurement a PMU."""
         values: list[float] = []
         for report in measurements:
-            _, _, va, vb, vc, v1, i1, frequency_hz, rocof_hz_s = report
+            _, va, vb, vc, v1, i1, frequency_hz, rocof_hz_s = report
             phasors = (*polar(va), *polar(vb), *polar(vc), *polar(v1), *polar(i1))
             values += (0, *phasors, frequency_hz, rocof_hz_s)
         soc, fracsec = timebase.from_ns(measurements[0].time_ns, self.config.time_base)

@@ -11,14 +11,13 @@ from bisect import insort
 from operator import itemgetter
 from typing import Final
 
-from pmutools.grid.draws import normal
+from pmutools.draws import normal
 from pmutools.grid.plant import Plant
 from pmutools.grid.scenarios import Scenario
 from pmutools.grid.signals import Bus, Drive
 
 NS: Final = 1_000_000_000
 AMBIENT_HZ: Final = 60
-_AMBIENT_KEY: Final = 0x10AD
 MAX_COMMANDS: Final = 4096
 """Commands under way at once; at 60/s that is a minute of delay. Of more, the oldest take effect at once."""
 
@@ -62,7 +61,7 @@ class Grid:
             if round(pulse.start_s * NS) <= since_ns < round(pulse.stop_s * NS):
                 power[pulse.input] += pulse.mw
         if self.scenario.ambient_mw:
-            draw = normal(self.seed, _AMBIENT_KEY, since_ns * AMBIENT_HZ // NS)
+            draw = normal(self.seed, "grid", "ambient", since_ns * AMBIENT_HZ // NS)
             power["brake"] += self.scenario.ambient_mw * draw
         return Drive(self.command_mw + power["probe"], power["brake"])
 

@@ -1,6 +1,6 @@
-"""What an emulated PMU reports of a bus: three phases, V1, a current, FREQ and ROCOF, with noise and delay.
+"""What an emulated PMU reports of a bus: three phases, V1, a current, FREQ and ROCOF, with noise.
 
-Plain numbers; putting them into C37.118 frames is done elsewhere.
+Plain numbers; putting them into C37.118 frames, and the delay until these arrive, are done elsewhere.
 """
 
 from __future__ import annotations
@@ -11,24 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from pmutools.grid.draws import normal
+from pmutools.draws import normal
 from pmutools.grid.signals import Bus
 
 _ROTATE: Final = (1 + 0j, cmath.rect(1, -2 * math.pi / 3), cmath.rect(1, 2 * math.pi / 3))
-_ANGLE, _MAGNITUDE, _DELAY = 1, 2, 3
-
-
-class Delay(NamedTuple):
-    """Stamp to departure, ms: normal, clipped (Table I)."""
-
-    mean_ms: float = 44.0
-    sd_ms: float = 0.0
-    low_ms: float = 0.0
-    high_ms: float = 1e3
-
-
-FIXED_DELAY: Final = Delay()
-TABLE_I_DELAY: Final = Delay(44.0, 1.3, 40.0, 48.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +35,6 @@ class PmuModel:
     noise_pu: float = 0.0
     """Standard deviation of white magnitude noise."""
     current_a: float = 800.0
-    delay: Delay = FIXED_DELAY
     seed: int = 0
 
 
@@ -57,8 +42,6 @@ class Measurement(NamedTuple):
     """One report. Phasors are RMS, in the frame of nominal frequency."""
 
     time_ns: int
-    departure_ns: int
-    """When it leaves the PMU."""
     va: complex
     vb: complex
     vc: complex
@@ -77,22 +60,16 @@ def measure(
 ) -> Measurement:
     """Report of ``buses`` at ``time_ns``, which is reporting instant ``slot``: all that the noise depends on."""
     bus = buses[pmu.bus]
-    key = (pmu.seed, pmu.idcode, slot)
     angle = pmu.angle_rad + pmu.swing * bus.angle_rad
     magnitude = bus.voltage_pu * pmu.nominal_kv * 1e3 / math.sqrt(3)
     if pmu.noise_rad:
-        angle += pmu.noise_rad * normal(*key, _ANGLE)
+        angle += pmu.noise_rad * normal(pmu.seed, str(pmu.idcode), "angle", slot)
     if pmu.noise_pu:
-        magnitude *= 1 + pmu.noise_pu * normal(*key, _MAGNITUDE)
-    delay_ms = pmu.delay.mean_ms
-    if pmu.delay.sd_ms:
-        delay_ms += pmu.delay.sd_ms * normal(*key, _DELAY)
-    delay_ms = max(pmu.delay.low_ms, min(pmu.delay.high_ms, delay_ms))
+        magnitude *= 1 + pmu.noise_pu * normal(pmu.seed, str(pmu.idcode), "magnitude", slot)
     v1 = cmath.rect(magnitude, angle)
     va, vb, vc = v1 * _ROTATE[0], v1 * _ROTATE[1], v1 * _ROTATE[2]
     return Measurement(
         time_ns=time_ns,
-        departure_ns=time_ns + round(delay_ms * 1e6),
         va=va,
         vb=vb,
         vc=vc,
@@ -107,9 +84,7 @@ _SWINGS: Final = (1.0, 0.97, 1.03, 0.95)
 _ANGLES_DEG: Final = {"north": (10.0, 14.0, 7.0, 17.0), "south": (-20.0, -24.0, -16.0, -29.0)}
 
 
-def fleet(
-    per_side: int = 4, *, noise_rad: float = 0.0, delay: Delay = FIXED_DELAY, seed: int = 0
-) -> tuple[PmuModel, ...]:
+def fleet(per_side: int = 4, *, noise_rad: float = 0.0, seed: int = 0) -> tuple[PmuModel, ...]:
     """The controller's PMUs: N1, N2 ... (IDCODE 101 ...) then S1, S2 ... (201 ...).
 
     N1 and S1 see exactly the plant's difference; the others swing a few percent more or less, as other substations do.
@@ -122,7 +97,6 @@ def fleet(
             angle_rad=math.radians(_ANGLES_DEG[bus][k % 4]),
             swing=_SWINGS[k % 4],
             noise_rad=noise_rad,
-            delay=delay,
             seed=seed,
         )
         for bus, first in (("north", 101), ("south", 201))

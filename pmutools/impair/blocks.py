@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.moment import Moment
 
 T = TypeVar("T")

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import CHK_SIZE, MIN_FRAME_SIZE, FrameType
+from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.scope import FIELDS, STATION_FIELDS, WHOLE, Scope, Span, byte_span
 from pmutools.impair.selectors import DATA, Selector, Test, selector

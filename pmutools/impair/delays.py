@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from pmutools.draws import Draws
 from pmutools.impair.blocks import Lanes
 from pmutools.impair.distributions import (
     DISTRIBUTIONS,
@@ -28,7 +29,6 @@ from pmutools.impair.distributions import (
     distribution_of,
     is_bare,
 )
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.quantiles import LEAST, MOST, Array, normal_cdf, normal_quantile
 from pmutools.impair.selectors import DATA, Selector, selector

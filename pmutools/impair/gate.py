@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.grammar import named_parts
 from pmutools.impair.moment import Moment
 from pmutools.impair.selectors import Selector, selector_of_any

@@ -9,10 +9,10 @@ import re
 from collections import deque
 from dataclasses import dataclass, field
 
+from pmutools.draws import Draws
 from pmutools.impair.blocks import Blocks
 from pmutools.impair.delays import DrawnTerms
 from pmutools.impair.distributions import Distribution, distribution
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.selectors import ANY, Selector, Test, selector_of_any

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from pmutools.draws import Draws
 from pmutools.impair.blocks import Lanes, chance
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.selectors import DATA, Selector, selector
 from pmutools.parsers import Indices, indices, integer, number, one_of, parsed_by, probability

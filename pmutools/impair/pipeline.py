@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
+from pmutools.draws import Draws
 from pmutools.errors import SettingsError
 from pmutools.impair.content import Corrupt, Corruption
-from pmutools.impair.draws import Draws
 from pmutools.impair.gate import HOLD_LIMIT, Gate, Verdict
 from pmutools.impair.grammar import named_parts
 from pmutools.impair.moment import CONTROL_LANE, Moment

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.outgoing import Outgoing
 from pmutools.impair.selectors import DATA, Selector, Test, selector

@@ -20,8 +20,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmutools.c37118.constants import FrameType
+from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.parsers import Indices, index_set, probability, seconds_ns, split_top
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pmutools.c37118.constants import Stat
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.scope import VALUE_FIELDS, Scope
 from pmutools.impair.wire_faults import WORD, Change, replaced_word

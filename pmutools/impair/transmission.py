@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
 from pmutools.impair.delays import Delay, DelaySource
-from pmutools.impair.draws import Draws
 from pmutools.impair.grammar import named_parts
 from pmutools.impair.link import Rate, RateLink, Slot, SlotLink
 from pmutools.impair.losses import Loss, Lost

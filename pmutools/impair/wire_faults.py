@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pmutools.c37118.constants import CHK_SIZE
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.moment import Moment
 from pmutools.impair.scope import Scope
 from pmutools.parsers import integer, parsed_by

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pmutools.draws import Draws
 from pmutools.impair.distributions import DISTRIBUTIONS, distribution
-from pmutools.impair.draws import Draws
 from pmutools.impair.quantiles import LEAST, MOST, Array
 
 N = 40_000

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.impairment import pipeline, play
 
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.losses import FourState, loss_model
 from pmutools.impair.moment import Moment
 from pmutools.impair.outgoing import Fate

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from pmutools.c37118.constants import FrameType
-from pmutools.impair.draws import Draws
+from pmutools.draws import Draws
 from pmutools.impair.moment import CONTROL_LANE, Moment
 from pmutools.impair.selectors import ANY, DATA, selector, selector_of_any
 from pmutools.timebase import NS

@@ -1,4 +1,4 @@
-"""Uniform draws that are a function of (seed, stream, stage, frame index, variate) and of nothing else.
+"""Random draws that are a function of (seed, stream, stage, frame index, variate) and of nothing else.
 
 So a stream or a stage that is added, a parameter that changes, a seek or a loop leaves every other draw as it was, and
 a library upgrade changes none: the generator is Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as
@@ -8,6 +8,8 @@ a library upgrade changes none: the generator is Philox4x32-10 (Salmon et al., "
 from __future__ import annotations
 
 import hashlib
+import math
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -65,3 +67,19 @@ class Draws:
         words = philox(index & _MASK, index >> 32, block, lanes, self._k0, self._k1)
         high, low = words[2:] if variate & 1 else words[:2]
         return ((high << 20 | low >> 12).astype(np.float64) + 0.5) * _SCALE
+
+
+_BLOCK = 256
+
+
+def normal(seed: int, stream: str, stage: str, index: int) -> float:
+    """A standard normal draw, by Box and Muller; those of neighbouring frames are computed together, so it is cheap."""
+    return _normals(seed, stream, stage, index // _BLOCK)[index % _BLOCK]
+
+
+@lru_cache(maxsize=1024)
+def _normals(seed: int, stream: str, stage: str, block: int) -> tuple[float, ...]:
+    draws = Draws(seed, stream, stage)
+    pairs = zip(*(draws.uniforms(block * _BLOCK, _BLOCK, variate).tolist() for variate in (0, 1)), strict=True)
+    # the scalar functions: numpy's depend on what the processor can
+    return tuple(math.sqrt(-2 * math.log(u)) * math.cos(2 * math.pi * v) for u, v in pairs)
