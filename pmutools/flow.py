@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -44,3 +45,18 @@ class Chunk(NamedTuple):
     stamp_source: StampSource = StampSource.CAPTURE
     lost_before: int = 0
     """Bytes of the flow known to be missing just before ``data`` (a hole in a capture)."""
+
+
+class Train(NamedTuple):
+    """Datagrams of one flow and one size, in order, end to end in ``data``: many chunks at little cost."""
+
+    data: bytes
+    size: int
+    arrivals_ns: Sequence[int | None]
+    flow: Flow
+    stamp_source: StampSource = StampSource.CAPTURE
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The datagrams one by one."""
+        for at, arrival_ns in zip(range(0, len(self.data), self.size), self.arrivals_ns, strict=True):
+            yield Chunk(self.data[at : at + self.size], arrival_ns, self.flow, self.stamp_source)

@@ -120,6 +120,10 @@ class Framer:
         self._scan(out, arrival_ns, stamp_source, final=not self.streaming)
         return out
 
+    def pass_over(self, nbytes: int) -> None:
+        """Bytes of the flow that were found to be whole frames without this framer, while nothing was pending."""
+        self._offset += nbytes
+
     def close(self) -> list[Frame | Skipped]:
         """End of the flow: what was held back is framed or skipped."""
         out: list[Frame | Skipped] = []

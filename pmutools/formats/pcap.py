@@ -38,7 +38,7 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> ByteSource:
         counts |= {f"packets {fate}": tally.packets[fate] for fate in LOSSES}
         return {name: count for name, count in counts.items() if count}
 
-    return ByteSource(path, kind, reader, defects, configs)
+    return ByteSource(path, kind, reader, defects, configs, reader.trains())
 
 
 class CaptureSink(FrameSink):

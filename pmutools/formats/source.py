@@ -13,9 +13,9 @@ from typing import NamedTuple, Protocol
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch, decode_batch, encode_batch
 from pmutools.c37118.config import StreamConfig, encode_config
 from pmutools.c37118.constants import FrameType
-from pmutools.c37118.demux import Demux, Loss, Message, Tally
+from pmutools.c37118.demux import DataRun, Demux, Loss, Message, Tally
 from pmutools.c37118.framer import Frame
-from pmutools.flow import Chunk, Flow, StampSource
+from pmutools.flow import Chunk, Flow, StampSource, Train
 from pmutools.timebase import from_ns
 
 BLOCK_FRAMES = 8192
@@ -56,9 +56,12 @@ class ByteSource:
         chunks: Iterable[Chunk],
         defects: Callable[[], dict[str, int]] = dict,
         configs: Iterable[StreamConfig] = (),
+        trains: Iterable[Chunk | Train] | None = None,
     ) -> None:
+        """``trains`` gives the same as ``chunks``, datagrams of one flow and size together."""
         self.path, self.kind, self.defects = path, kind, defects
         self._chunks = chunks
+        self._trains = chunks if trains is None else trains
         self._demux = Demux(configs)
         self.tally = self._demux.tally
 
@@ -68,7 +71,13 @@ class ByteSource:
         yield from self._demux.close()
 
     def blocks(self) -> Iterator[Block | Message | Loss]:
-        return gather(self.items())
+        return gather(self._runs())
+
+    def _runs(self) -> Iterator[Message | Loss | DataRun]:
+        demux = self._demux
+        for piece in self._trains:
+            yield from demux.feed_train(piece) if isinstance(piece, Train) else demux.feed(piece)
+        yield from demux.close()
 
 
 class MessageSource:
@@ -158,24 +167,37 @@ class Gatherer:
         self._runs: dict[tuple[Flow, int], _Run] = {}
 
     def add(self, message: Message) -> Block | None:
-        """Take a data message; a block comes back when one is full or the stream's configuration changed."""
-        frame, flow, config = message
+        """Take a data message; a block comes back when one was full or the stream's configuration changed."""
+        (data, arrival_ns, source, _), flow, config = message
         assert config is not None
-        key = (flow, config.idcode)
-        run = self._runs.get(key)
-        block = None
-        if run is None or run.config is not config:
-            if run is not None and run.config != config:
-                block, run = run.block(flow), None
-            if run is None:
-                run = self._runs[key] = _Run(config)
-        data, arrival_ns, source, _ = frame
+        run, block = self._run(flow, config, 1)
         run.frames.append(data)
         run.arrivals.append(NO_TIME if arrival_ns is None else arrival_ns)
         run.sources.append(source)
-        if block is None and len(run.frames) >= self.frames:
-            block = self._runs.pop(key).block(flow)
         return block
+
+    def add_run(self, frames: DataRun) -> Block | None:
+        """:meth:`add` for data frames that came together; they stay in one block."""
+        (data, _, arrivals_ns, flow, source), config = frames
+        run, block = self._run(flow, config, len(arrivals_ns))
+        run.frames.append(data)
+        run.arrivals += [NO_TIME if arrival_ns is None else arrival_ns for arrival_ns in arrivals_ns]
+        run.sources += [source] * len(arrivals_ns)
+        return block
+
+    def _run(self, flow: Flow, config: StreamConfig, count: int) -> tuple[_Run, Block | None]:
+        """Where ``count`` more frames go, and what is complete without them."""
+        key = (flow, config.idcode)
+        run = self._runs.get(key)
+        if (
+            run is not None
+            and len(run.arrivals) + count <= self.frames
+            and (run.config is config or run.config == config)
+        ):
+            return run, None
+        block = run.block(flow) if run is not None else None
+        run = self._runs[key] = _Run(config)
+        return run, block
 
     def flush(self) -> Iterator[Block]:
         """All that is waiting."""
@@ -184,14 +206,18 @@ class Gatherer:
             yield run.block(flow)
 
 
-def gather(items: Iterable[Message | Loss], frames: int = BLOCK_FRAMES) -> Iterator[Block | Message | Loss]:
+def gather(items: Iterable[Message | Loss | DataRun], frames: int = BLOCK_FRAMES) -> Iterator[Block | Message | Loss]:
     """Data messages gathered into blocks of up to ``frames``; everything else passes through."""
     gatherer = Gatherer(frames)
     data = FrameType.DATA
     for item in items:
         if isinstance(item, Message) and item.frame.type is data:
-            if (block := gatherer.add(item)) is not None:
-                yield block
+            block = gatherer.add(item)
+        elif isinstance(item, DataRun):
+            block = gatherer.add_run(item)
         else:
             yield item
+            continue
+        if block is not None:
+            yield block
     yield from gatherer.flush()

@@ -6,6 +6,8 @@ lengths agree with each other. All others take the general way (``link``, ``ip``
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +39,10 @@ _TCP = np.dtype(
 _ETHERTYPE = np.dtype(">u2")
 
 
+TRAIN = 32
+"""Fewer equal datagrams of a flow are not worth working on together."""
+
+
 class Plain(NamedTuple):
     """Of N packets: which are plain UDP, which plain TCP; of these the flow's key, where the payload is, and (TCP) the
     sequence number, the one acknowledged, and the flags. All of shape (N,)."""
@@ -65,6 +71,20 @@ def plain(records: Records) -> Plain:
     begin = at + 20 + np.where(tcp, header, 8)
     columns = segment["sequence"], segment["acknowledged"], segment["flags"]
     return Plain(udp, tcp, head["key"], begin, at + total, *columns)
+
+
+def alike(short: Plain) -> Iterator[Ints]:
+    """The rows of each flow that sends plain UDP datagrams of one size only, :data:`TRAIN` of them at least."""
+    rows = np.flatnonzero(short.udp)
+    words = np.ascontiguousarray(short.key[rows]).view("u4").reshape(-1, 3)
+    order = np.lexsort(words.T)
+    words, rows = words[order], rows[order]
+    ends = np.flatnonzero((words[1:] != words[:-1]).any(1)) + 1
+    for first, after in pairwise([0, *ends.tolist(), len(rows)]):
+        of_flow = rows[first:after]
+        size = short.end[of_flow] - short.begin[of_flow]
+        if len(of_flow) >= TRAIN and size[0] > 0 and (size == size[0]).all():
+            yield of_flow
 
 
 def _network(records: Records) -> tuple[Ints, Mask]:
