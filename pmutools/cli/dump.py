@@ -7,7 +7,7 @@ from typing import IO
 
 import click
 
-from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.shell import Exit, Talk, common, visible
 from pmutools.cli.sources import DURATION, TARGET, open_target
 
 TYPES = ("data", "cfg1", "cfg2", "cfg3", "header", "command", "skipped")
@@ -28,7 +28,8 @@ def command(
     import json
 
     from pmutools.c37118.demux import Loss
-    from pmutools.tools.describe import describe, one_line
+    from pmutools.cli.dump_text import one_line
+    from pmutools.tools.describe import describe
 
     talk = Talk(quiet, verbose)
     skipped = frames = 0
@@ -41,7 +42,7 @@ def command(
                 frames += 1
             described = describe(item)
             if not types or described["type"] in types:
-                line = json.dumps(described, separators=(",", ":")) if as_json else one_line(described)
+                line = json.dumps(described, separators=(",", ":")) if as_json else visible(one_line(described))
                 out.write(f"{line}\n")
         defects = source.defects()
     for name, count in defects.items():

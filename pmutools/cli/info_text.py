@@ -10,6 +10,7 @@ from rich.markup import escape
 from pmutools import timebase
 from pmutools.c37118.config import Station
 from pmutools.c37118.constants import Format
+from pmutools.cli.shell import visible
 from pmutools.tools.inventory import Inventory, StreamInventory
 
 CHANNELS_SHOWN = 12
@@ -20,7 +21,7 @@ def show(inventory: Inventory) -> None:
     console = Console(highlight=False, soft_wrap=True)
     counts = ", ".join(f"{count} {kind.name.lower()}" for kind, count in sorted(inventory.frames.items()))
     console.print(
-        f"[bold]{inventory.path}[/]  {inventory.kind}, {inventory.bytes_in} bytes of payload: {counts} frames"
+        f"[bold]{escape(inventory.path)}[/]  {inventory.kind}, {inventory.bytes_in} bytes of payload: {counts} frames"
     )
     for stream in inventory.streams:
         _stream(console, stream)
@@ -32,13 +33,13 @@ def show(inventory: Inventory) -> None:
     for reason, nbytes in inventory.skipped.items():
         console.print(f"[yellow]skipped[/]: {nbytes} bytes, {reason}")
     for name, count in inventory.defects.items():
-        console.print(f"[yellow]defect[/]: {name}: {count}")
+        console.print(f"[yellow]defect[/]: {escape(name)}: {count}")
 
 
 def _stream(console: Console, stream: StreamInventory) -> None:
     config, flow = stream.config, stream.flow
     where = f"{flow.source} > {flow.destination}" if flow.destination else flow.source
-    console.print(f"\n[bold]stream {stream.idcode}[/]  {flow.transport} {where}")
+    console.print(f"\n[bold]stream {stream.idcode}[/]  {flow.transport} {escape(visible(where))}")
     rate = f"{float(config.rate):g} frames/s" if config.rate else "rate undefined"
     if (measured := stream.measured_hz) is not None:
         rate += f" (measured {measured:.3f})"
@@ -57,7 +58,7 @@ def _stream(console: Console, stream: StreamInventory) -> None:
 
 def _station(console: Console, station: Station) -> None:
     facts = f"IDCODE {station.idcode}, {station.fnom_hz:g} Hz, {format_text(station.format)}"
-    console.print(f"  [bold]{escape(station.name)}[/]  {facts}")
+    console.print(f"  [bold]{escape(visible(station.name))}[/]  {facts}")
     names = [
         _names("phasors", [f"{channel.name} ({channel.kind})" for channel in station.phasors]),
         _names("analogs", [channel.name for channel in station.analogs]),
@@ -65,7 +66,7 @@ def _station(console: Console, station: Station) -> None:
     ]
     text = "; ".join(filter(None, names)) or "no channels but frequency and ROCOF"
     for line in textwrap.wrap(text, 92):
-        console.print(f"    {line}", markup=False)
+        console.print(f"    {visible(line)}", markup=False)
 
 
 def format_text(fmt: Format) -> str:

@@ -71,6 +71,11 @@ def common(function: F) -> F:
     return function
 
 
+def visible(text: str) -> str:
+    """``text`` with what does not print (line ends, control sequences of a terminal) escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 class Talk:
     """Talk to the person: always on stderr, so that stdout is data."""
 
@@ -87,13 +92,13 @@ class Talk:
     def complain(self, text: str) -> None:
         """Say what went wrong: shown with ``--quiet`` too."""
         self._clear()
-        click.echo(text, err=True)
+        click.echo(visible(text), err=True)
 
     def progress(self, text: str) -> None:
         """A line that the next one overwrites; only where a person is watching."""
         if not self.quiet and sys.stderr.isatty():
             self._clear()
-            click.echo(text, err=True, nl=False)
+            click.echo(visible(text), err=True, nl=False)
             self._shown = True
 
     def _clear(self) -> None:
@@ -152,14 +157,19 @@ def run(command: click.Command, arguments: Sequence[str], *, name: str | None = 
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a station's name is no reason to fail
     try:
-        code = command.main(list(arguments), prog_name=name, standalone_mode=False)
+        if f"_{name}_COMPLETE".replace("-", "_").upper() in os.environ:  # a shell asks what could come next
+            command.main(list(arguments), prog_name=name)
+        with command.make_context(name, list(arguments)) as ctx:
+            code = command.invoke(ctx)
         sys.stdout.flush()
         return int(code or 0)
+    except click.exceptions.Exit as end:  # --help, --version
+        return end.exit_code
     except (KeyboardInterrupt, click.Abort):
         return Exit.INTERRUPTED
     except BrokenPipeError:
         return _unread()
-    except SystemExit as end:  # so click and rich say that a pipe is broken
+    except SystemExit as end:  # so rich says that a pipe is broken
         if not isinstance(end.__context__, BrokenPipeError):
             raise
         return _unread()
@@ -200,7 +210,7 @@ def _judged(error: Exception, name: str) -> tuple[Exit, str]:
 
 
 def _line(name: str, what: object) -> str:
-    return f"{name}: {' '.join(str(what).split())}"
+    return visible(f"{name}: {' '.join(str(what).split())}")
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
