@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from dcon.session.log import LoggedTick
     from dcon.session.replay import Observer
 
+TOLD_TICKS = 3600
+
 
 @click.command(name="replay", short_help="A recorded session through the engine again; commands must be identical.")
 @click.argument("session", metavar="SESSION")
@@ -33,8 +36,16 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
     from dcon.session.replay import replay
 
     talk = Talk(quiet, verbose)
-    with _commands(out) as observe:
+    replayed = itertools.count(1)
+    with _commands(out) as write:
+
+        def observe(tick: LoggedTick, now: Record) -> None:
+            write(tick, now)
+            if (count := next(replayed)) % TOLD_TICKS == 0:
+                talk.progress(f"{count} ticks")
+
         result = replay(session, changes, observe)
+    talk.progress("")
     if as_json:
         click.echo(json.dumps(result.to_json()))
     elif changes:
@@ -54,10 +65,10 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
 
 
 @contextmanager
-def _commands(out: Path | None) -> Iterator[Observer | None]:
+def _commands(out: Path | None) -> Iterator[Observer]:
     """Writes one row a tick to ``out``."""
     if out is None:
-        yield None
+        yield lambda tick, now: None
         return
     try:
         with out.open("w", encoding="ascii") as file:

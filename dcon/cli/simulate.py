@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,13 +94,18 @@ def command(
             raise SourceError(f"--out {out}: {error.strerror}") from None
     for number, each in enumerate(plans, 1):
         path = None if out is None else str(out / ("session.mcap" if len(plans) == 1 else f"session-{number}.mcap"))
-        outcome = simulate(each, path)
+        outcome = simulate(each, path, partial(_progress, talk, f"run {number} of {len(plans)}"))
+        talk.progress("")
         if as_json:
             click.echo(json.dumps(outcome.to_json() | ({"session": path} if path else {})))
         else:
             click.echo(_line(outcome) if len(plans) > 1 else _text(outcome))
         if path:
             talk.say(f"session log: {path}")
+
+
+def _progress(talk: Talk, run: str, now_s: float) -> None:
+    talk.progress(f"{run}: {now_s:.0f} s")
 
 
 def _swept(plan: Plan, sweeps: tuple[str, ...]) -> list[Plan]:

@@ -7,7 +7,7 @@ Only clocks and sockets are missing. A run is a function of its plan.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -102,10 +102,15 @@ def settings_of(plan: Plan, pmus: Sequence[PmuModel]) -> Settings:
     return parse(text, f"simulation of {plan.scenario}")
 
 
-def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
+Tell = Callable[[float], None]
+TOLD_TICKS = 600
+
+
+def simulate(plan: Plan, log_path: str | None = None, tell: Tell | None = None) -> Outcome:
     """Run a plan, with its session logged if ``log_path`` is given, and judge its ringdown.
 
-    Raises SettingsError for what the plan names and there is not, SourceError where the log cannot be written.
+    ``tell`` is given the simulated seconds now and then. Raises SettingsError for what the plan names and there is not,
+    SourceError where the log cannot be written.
     """
     pmus = fleet(noise_rad=plan.noise_rad, seed=plan.seed)
     if unmatched := plan.profile.unmatched((pmu.name, str(pmu.idcode), pmu.bus) for pmu in pmus):
@@ -122,7 +127,7 @@ def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
         configs[sender.pmu.name] = sender.stream.config_frame(START_NS)
     outcome = Outcome(plan)
     if log_path is None:
-        _run(plan, delays, senders, engine, outcome, None)
+        _run(plan, delays, senders, engine, outcome, None, tell)
     else:
         metadata = {
             "scenario": plan.scenario,
@@ -140,7 +145,7 @@ def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
             instances=settings.params.instance_names,
             flags=CORE.names,
         ) as log:
-            _run(plan, delays, senders, engine, outcome, log)
+            _run(plan, delays, senders, engine, outcome, log, tell)
     if plan.course.ringdown_s is not None:
         if plan.control:
             outcome.mode = judge(outcome.swing_mhz, plan)
@@ -149,7 +154,13 @@ def simulate(plan: Plan, log_path: str | None = None) -> Outcome:
 
 
 def _run(
-    plan: Plan, delays: Delays, senders: Sequence[_Sender], engine: Engine, outcome: Outcome, log: SessionWriter | None
+    plan: Plan,
+    delays: Delays,
+    senders: Sequence[_Sender],
+    engine: Engine,
+    outcome: Outcome,
+    log: SessionWriter | None,
+    tell: Tell | None,
 ) -> None:
     grid = _grid(plan, delays.command_ns)
     operator = EagerOperator()
@@ -173,7 +184,9 @@ def _run(
         orders = operator.orders(engine.state.system) if plan.control else ()
         tick = engine.tick(frames, orders, tick_ns)
         grid.command(tick.record.output_v * MW_PER_V, tick_ns)
-        _note(outcome, tick.record, engine)
+        _note(outcome, tick.record)
+        if tell is not None and number % TOLD_TICKS == 0:
+            tell(outcome.tick_s[-1])
         if log is not None:
             log.tick(tick.record, tick.frames, orders)
 
@@ -205,7 +218,7 @@ def _measure(
                 yield START_NS + out.offset_ns, sender.pmu.name, out.data
 
 
-def _note(outcome: Outcome, record: Record, engine: Engine) -> None:
+def _note(outcome: Outcome, record: Record) -> None:
     time_s = (record.tick_ns - START_NS) / timebase.NS
     outcome.tick_s.append(time_s)
     outcome.delta_f_mhz.append(record.delta_f_mhz)
