@@ -247,7 +247,7 @@ class Platform:
             name = self.settings.sites[owner].name
             if frame.type is FrameType.DATA:
                 self._frames.setdefault(name, []).append(frame)
-            elif config is not None and frame.type is not FrameType.CFG1:
+            elif config is not None and frame.type.rules_data:
                 self._configure(name, config, frame)
 
     def _configure(self, name: str, config: StreamConfig, frame: Frame) -> None:

@@ -29,6 +29,11 @@ except ImportError:  # no wheel for this platform: the standard library is two t
     chk = _plain_chk
 
 
+def sealed(body: bytes) -> bytes:
+    """The frame of ``body``: with its CHK behind it."""
+    return body + chk(body).to_bytes(2, "big")
+
+
 def chk_array(frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     """CHK of each row of ``frames`` (N, B), over all B bytes; a row that ends in its own CHK gives 0."""
     import numpy as np

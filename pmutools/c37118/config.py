@@ -15,7 +15,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from pmutools.c37118.checksum import chk
+from pmutools.c37118.checksum import sealed
 from pmutools.c37118.constants import (
     CHK_SIZE,
     FNOM_50_HZ,
@@ -65,6 +65,11 @@ class PhasorChannel:
         if self.phscale is not None:
             return "I" if self.phscale.type & PHSCALE_CURRENT else "V"
         return "I" if self.phunit >> 24 & 1 else "V"
+
+    @property
+    def unit(self) -> float:
+        """V or A a count of a 16-bit phasor, as PHUNIT says."""
+        return (self.phunit & 0xFFFFFF) * 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,8 +235,7 @@ def encode_config(config: StreamConfig, *, soc: int = 0, fracsec: int = 0, time_
     if size > MAX_FRAME_SIZE:
         raise EncodeError(f"configuration of {config.idcode} takes {size} bytes, FRAMESIZE ends at {MAX_FRAME_SIZE}")
     sync = config.kind.sync & 0xFFF0 | config.version
-    frame = encode_prefix(Prefix(sync, size, config.idcode, soc, time_quality, fracsec)) + config.body
-    return frame + chk(frame).to_bytes(2, "big")
+    return sealed(encode_prefix(Prefix(sync, size, config.idcode, soc, time_quality, fracsec)) + config.body)
 
 
 def as_kind(config: StreamConfig, kind: FrameType) -> StreamConfig:
@@ -464,7 +468,7 @@ def _write_station3(station: Station) -> bytes:
 
 def _scale_of(channel: PhasorChannel, fmt: Format) -> PhasorScale:
     current = PHSCALE_CURRENT if channel.kind == "I" else 0
-    scale = 1.0 if fmt & Format.PHASOR_FLOAT else (channel.phunit & 0xFFFFFF) * 1e-5
+    scale = 1.0 if fmt & Format.PHASOR_FLOAT else channel.unit
     return PhasorScale(0, current | 1, 0, scale, 0.0)
 
 

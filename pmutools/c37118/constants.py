@@ -36,6 +36,11 @@ class FrameType(IntEnum):
         return self in _CONFIGS
 
     @property
+    def rules_data(self) -> bool:
+        """Whether it is the configuration that data are sent by; CFG-1 says what a device could send."""
+        return self in _IN_FORCE
+
+    @property
     def version(self) -> int:
         """The version nibble a 2011 sender writes: 2 for CFG-3 only."""
         return 2 if self is FrameType.CFG3 else 1
@@ -46,7 +51,8 @@ class FrameType(IntEnum):
         return SYNC << 8 | self << 4 | self.version
 
 
-_CONFIGS = frozenset((FrameType.CFG1, FrameType.CFG2, FrameType.CFG3))
+_IN_FORCE = frozenset((FrameType.CFG2, FrameType.CFG3))
+_CONFIGS = _IN_FORCE | {FrameType.CFG1}
 
 
 class Command(IntEnum):

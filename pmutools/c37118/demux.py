@@ -280,7 +280,7 @@ class Demux:
         except WireError:
             pass  # a good frame whose content is not: it stays a message, with no configuration
         self._emit(Message(frame, state.flow, config), kind, out)
-        if config is None or kind is FrameType.CFG1:  # CFG-1 says what a device could send, not what it sends
+        if config is None or not kind.rules_data:
             return
         current = state.configs.get(config.idcode)
         place = (state.host, config.idcode)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from pmutools import timebase
-from pmutools.c37118.checksum import chk
+from pmutools.c37118.checksum import chk, sealed
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import (
     CHK_SIZE,
@@ -26,7 +26,7 @@ from pmutools.c37118.constants import (
     command_name,
 )
 from pmutools.c37118.layout import Layout, layout_of
-from pmutools.c37118.prefix import Prefix, encode_prefix, verified
+from pmutools.c37118.prefix import Prefix, decode_prefix, encode_prefix, verified
 from pmutools.errors import EncodeError, LengthError, WireError
 
 NAN = float("nan")
@@ -177,6 +177,12 @@ def unpack_data(frame: bytes, config: StreamConfig, layout: Layout) -> Data:
     return data
 
 
+def stamp_ns(frame: bytes, config: StreamConfig) -> int:
+    """SOC and FRACSEC of a frame of this stream, POSIX UTC: of a data frame, when it was measured."""
+    prefix = decode_prefix(frame)
+    return timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base)
+
+
 def encode_data(data: Data) -> bytes:
     """The frame of ``data.values``, with FRAMESIZE and CHK computed; raises EncodeError for a value out of range."""
     values = list(data.values)
@@ -185,16 +191,14 @@ def encode_data(data: Data) -> bytes:
         frame = data.layout.unpacker.pack(*values)
     except struct.error as error:
         raise EncodeError(f"data frame of {data.config.idcode}: {error}") from None
-    body = frame[:-CHK_SIZE]
-    return body + chk(body).to_bytes(2, "big")
+    return sealed(frame[:-CHK_SIZE])
 
 
 def restamp(frame: bytes, soc: int, fracsec: int, *, idcode: int | None = None) -> bytes:
     """The same frame at another time (and for another stream): SOC, FRACSEC, IDCODE and CHK alone change."""
     stamp = soc.to_bytes(4, "big") + frame[10:11] + fracsec.to_bytes(3, "big")
     head = frame[:4] + (frame[4:6] if idcode is None else idcode.to_bytes(2, "big"))
-    body = head + stamp + frame[PREFIX_SIZE:-CHK_SIZE]
-    return body + chk(body).to_bytes(2, "big")
+    return sealed(head + stamp + frame[PREFIX_SIZE:-CHK_SIZE])
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,8 +273,7 @@ def _encode(kind: FrameType, idcode: int, payload: bytes, soc: int, fracsec: int
 
 
 def _seal(prefix: Prefix, payload: bytes) -> bytes:
-    body = encode_prefix(prefix) + payload
-    return body + chk(body).to_bytes(2, "big")
+    return sealed(encode_prefix(prefix) + payload)
 
 
 def wire_values(config: StreamConfig, prefix: Sequence[int], stations: Sequence[Sequence[int | float]]) -> Data:

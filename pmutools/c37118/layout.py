@@ -222,7 +222,7 @@ def _phasor_slot(channel: PhasorChannel, fmt: Format, index: int) -> PhasorSlot:
     if channel.phscale is not None:
         factor, turn = channel.phscale.scale, channel.phscale.angle_offset_rad
     else:
-        factor, turn = (1.0 if floating else (channel.phunit & 0xFFFFFF) * 1e-5), 0.0
+        factor, turn = (1.0 if floating else channel.unit), 0.0
     return PhasorSlot(index, bool(fmt & Format.POLAR), floating, factor, turn)
 
 

@@ -176,7 +176,7 @@ def _understood(frame: bytes) -> bool:
             config = decode_config_body(prefix, frame[PREFIX_SIZE:-CHK_SIZE])
         except WireError:
             return False
-        if kind != FrameType.CFG1 and not chk(frame):
+        if FrameType(kind).rules_data and not chk(frame):
             learn(config)
         return True
     return kind == FrameType.HEADER

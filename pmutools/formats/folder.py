@@ -8,11 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message, Tally
-from pmutools.c37118.prefix import decode_prefix
+from pmutools.c37118.frames import stamp_ns
 from pmutools.formats.source import Block, Source
 
 
@@ -84,8 +83,7 @@ def _item_times(item: Message | Loss) -> tuple[int, int]:
     arrival_ns = NO_TIME if frame.arrival_ns is None else frame.arrival_ns
     if config is None or frame.type is not FrameType.DATA:
         return NO_TIME, arrival_ns
-    prefix = decode_prefix(frame.data)
-    return timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base), arrival_ns
+    return stamp_ns(frame.data, config), arrival_ns
 
 
 def _block_times(item: Block | Message | Loss) -> tuple[int, int]:

@@ -69,7 +69,7 @@ class LogSink(FrameSink):
             name = self._names[key] = unique([_name(config)], self._names.values())[0]
         if frame.type.is_config:
             self._topics.config(name, frame.data, frame.arrival_ns or 0)
-            if frame.type is not FrameType.CFG1:
+            if frame.type.rules_data:
                 self._configs[key] = config
             return
         if self._configs.get(key) != config:

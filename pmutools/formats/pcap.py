@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from pmutools import timebase
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
-from pmutools.c37118.prefix import decode_prefix
+from pmutools.c37118.frames import stamp_ns
 from pmutools.flow import Chunk
 from pmutools.formats.capture import CaptureReader, CaptureWriter, Fate
 from pmutools.formats.capture.pcapng import is_pcapng
@@ -58,8 +57,7 @@ class CaptureSink(FrameSink):
         arrival_ns = frame.arrival_ns
         if arrival_ns is None and self._stamps_needed:
             if config is not None:
-                prefix = decode_prefix(frame.data)
-                self._last_ns = timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base)
+                self._last_ns = stamp_ns(frame.data, config)
             arrival_ns = self._last_ns
         if flow.transport == "tcp" and not flow.destination:
             host = "[::]" if flow.source.startswith("[") else "0.0.0.0"

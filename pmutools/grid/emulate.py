@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from pmutools import timebase
-from pmutools.c37118.checksum import chk
+from pmutools.c37118.checksum import sealed
 from pmutools.c37118.config import PhasorChannel, Station, StreamConfig, encode_config
-from pmutools.c37118.constants import Format, FrameType
+from pmutools.c37118.constants import CHK_SIZE, Format, FrameType
 from pmutools.c37118.layout import layout_of
 from pmutools.grid.pmu_model import PHASORS, Measurement, PmuModel
 
@@ -56,5 +56,4 @@ class EmulatedStream:
             values += (0, *phasors, frequency_hz, rocof_hz_s)
         soc, fracsec = timebase.from_ns(measurements[0].time_ns, self.config.time_base)
         packer, head = self._packing
-        frame = packer.pack(*head, soc, fracsec, *values, 0)[:-2]
-        return frame + chk(frame).to_bytes(2, "big")
+        return sealed(packer.pack(*head, soc, fracsec, *values, 0)[:-CHK_SIZE])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from pmutools.c37118.checksum import chk
+from pmutools.c37118.checksum import sealed
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import CHK_SIZE, MIN_FRAME_SIZE, FrameType
 from pmutools.draws import Draws
@@ -107,5 +107,5 @@ class Corruption:
         changed = bytearray(frame)
         done = self._change(changed, at, self._last)
         if done and self._refit:
-            changed[-CHK_SIZE:] = chk(bytes(changed[:-CHK_SIZE])).to_bytes(CHK_SIZE, "big")
+            changed[:] = sealed(bytes(changed[:-CHK_SIZE]))
         return bytes(changed), f"corrupt:{done}" if done else ""

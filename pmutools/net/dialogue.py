@@ -85,7 +85,7 @@ class Dialogue:
             actions = role.hear_data(frame.data, config, now_ns)
             if actions or role.state is not before:
                 self._after(before, actions)
-        elif config is not None and kind in (FrameType.CFG2, FrameType.CFG3):
+        elif config is not None and frame.type.rules_data:
             if config != self._known:
                 self._known = config
                 self._tell(LinkKind.CONFIGURED, f"{config.kind.name}, {_rate(config)}, {len(config.stations)} stations")

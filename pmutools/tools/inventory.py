@@ -158,7 +158,7 @@ def take_inventory(source: Source) -> Inventory:
         if isinstance(item, Loss):
             continue
         if isinstance(item, Message):
-            if item.config is not None and item.frame.type in (FrameType.CFG2, FrameType.CFG3):
+            if item.config is not None and item.frame.type.rules_data:
                 key = (item.flow, item.config.idcode)
                 streams.setdefault(key, StreamInventory(item.flow, item.config.idcode, item.config))
             continue

@@ -8,21 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmutools import timebase
-from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
-from pmutools.c37118.prefix import decode_prefix
+from pmutools.c37118.frames import stamp_ns
 from pmutools.errors import SettingsError
 from pmutools.formats.source import Block
 
 FOREVER = 1 << 62
 """Further from 1970 than any stamp, in ns."""
-
-
-def stamp_of(frame: bytes, config: StreamConfig) -> int:
-    """Time of measurement of a data frame, POSIX UTC ns."""
-    prefix = decode_prefix(frame)
-    return timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +102,7 @@ class Window:
         frame, _, config = message
         inside = True
         if frame.type is FrameType.DATA and config is not None:
-            time_ns = stamp_of(frame.data, config)
+            time_ns = stamp_ns(frame.data, config)
             low, high = self.bounds(time_ns)
             inside = low <= time_ns < high
         return inside and (not self.idcodes or frame.idcode in self.idcodes)

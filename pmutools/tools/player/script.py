@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from pmutools import timebase
+from pmutools.c37118 import frames
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
@@ -19,7 +20,7 @@ from pmutools.c37118.framer import Frame
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Flow
 from pmutools.formats.columns import unique
-from pmutools.tools.window import FOREVER, Window, stamp_of
+from pmutools.tools.window import FOREVER, Window
 
 LATENCY_MAX_NS = timebase.NS
 """A recorded latency outside 0..1 s is a clock's doing, and counts as 0."""
@@ -115,7 +116,7 @@ def study(
     found: dict[tuple[Flow, int], StreamScript] = {}
     low, high = -FOREVER, FOREVER
     for frame, flow, config in _data(items):
-        stamp_ns = stamp_of(frame.data, config)
+        stamp_ns = frames.stamp_ns(frame.data, config)
         low, high = window.bounds(stamp_ns)
         stream = found.get((flow, config.idcode))
         if stream is None:
@@ -142,7 +143,7 @@ def cues(script: Script, items: Iterable[Message | Loss]) -> Iterator[Cue]:
         stream = index.get((flow, config.idcode))
         if stream is None:
             continue
-        stamp_ns, number = stamp_of(frame.data, config), counts[stream]
+        stamp_ns, number = frames.stamp_ns(frame.data, config), counts[stream]
         counts[stream] += 1
         if not script.low_ns <= stamp_ns < script.high_ns:
             continue
