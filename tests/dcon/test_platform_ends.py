@@ -1,0 +1,115 @@
+"""How a session in real time ends: by its time, on request, for want of a log, by an error; each time with 0 V."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from support.virtual_platform import Bench, Item, stream, virtual_platform
+
+from dcon.core.values import Record, SystemState
+from dcon.engine import Engine
+from dcon.limiter import SLEW_MW_PER_S
+from dcon.session.log import SessionWriter
+from pmutools.errors import SourceError
+
+Make = Callable[..., Bench]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
+    def make(items: Iterable[tuple[int, Item]] = (), name: str = "s.mcap") -> Bench:
+        return virtual_platform(tmp_path / name, items, monkeypatch)
+
+    return make
+
+
+def active_mw(made: Bench, at_s: float) -> float:
+    """The command at a time; the tests below want it to be far from 0 when the end comes."""
+    k = next(k for k, sent in enumerate(made.driver.sent) if sent[2] >= at_s)
+    return made.driver.sent[k][1] * 12.5
+
+
+def ramped(made: Bench, at_s: float) -> None:
+    assert abs(active_mw(made, at_s)) > 10
+    assert max(made.steps_mw()) <= SLEW_MW_PER_S / 60 + 1e-9
+    down = [volts * 12.5 for *_, volts, passed in made.driver.sent if passed > at_s + 0.02]
+    assert all(abs(b) <= abs(a) + 1e-9 for a, b in pairwise(down))
+    assert made.driver.sent[-1][2] - at_s == pytest.approx(1.0, abs=0.06)
+
+
+def test_the_end_of_its_time_ramps_the_command_down(bench: Make) -> None:
+    made = bench(stream(6))
+    summary = made.run(3.2)
+    assert summary.final_state == "STANDBY"
+    ramped(made, 3.21)
+    made.ended_well()
+
+
+def test_a_request_to_stop_ramps_the_command_down(bench: Make) -> None:
+    made = bench(stream(6))
+    made.clock.at(3.2, made.platform.stop)
+    summary = made.run(None)
+    assert summary.final_state == "STANDBY"
+    ramped(made, 3.21)
+    made.ended_well()
+
+
+def test_a_request_to_stop_while_nothing_is_driven_ends_at_once(bench: Make) -> None:
+    made = bench(stream(2))
+    made.platform.stop()
+    assert made.run(None).ticks == 0
+    assert [volts for _, volts, _ in made.driver.sent] == [0.0]
+
+
+def test_a_log_that_cannot_be_written_ends_the_session_with_a_ramp(
+    bench: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A full disk: nothing unrecorded is driven for longer than the ramp, and there is no step."""
+    made = bench(stream(6))
+    write = SessionWriter.tick
+
+    def full(self: SessionWriter, record: Record, *args: object, **given: object) -> None:
+        if made.clock.passed_s > 3.2:
+            raise SourceError("s.mcap: cannot write: No space left on device")
+        write(self, record, *args, **given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(SessionWriter, "tick", full)
+    with pytest.raises(SourceError, match="No space left on device"):
+        made.run(20)
+    assert caplog.text.count("No space left") == 1
+    ramped(made, 3.22)
+    assert made.records[-1].state is SystemState.ACTIVE  # the last that was written
+    made.ended_well()
+
+
+def test_a_log_that_cannot_be_opened(bench: Make, tmp_path: Path) -> None:
+    made = bench(stream(1))
+    made.path = tmp_path / "no" / "s.mcap"
+    with pytest.raises(SourceError, match=r"^[^\n]*No such file[^\n]*$"):
+        made.run(1)
+    assert [volts for _, volts, _ in made.driver.sent] == [0.0]
+    assert made.driver.closed and made.script.closed
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a bug"), KeyboardInterrupt(), MemoryError()])
+def test_whatever_else_goes_wrong_leaves_0_v_and_a_readable_log(
+    error: BaseException, bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = bench(stream(6))
+    tick = Engine.tick
+
+    def failing(self: Engine, frames: object, orders: object, now_ns: int) -> object:
+        if made.clock.passed_s > 3.2:
+            raise error
+        return tick(self, frames, orders, now_ns)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Engine, "tick", failing)
+    with pytest.raises(type(error)):
+        made.run(20)
+    monkeypatch.undo()
+    assert abs(made.driver.sent[-2][1]) > 0.5
+    assert len(made.records) == len(made.driver.sent) - 1
+    made.ended_well()
