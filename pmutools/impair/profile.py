@@ -200,7 +200,14 @@ def _actions(section: Section, read: ReadText | None) -> Iterator[Action]:
             raise entry.where.error(f"unknown key; {suggestion(key, ('do',))}")
         for line in entry.text.split("\n"):
             if line.strip():
-                yield entry._replace(text=line).read(lambda text: parse_action(text, read))._replace(at_ns=at_ns)
+                yield entry._replace(text=line).read(lambda text: _scheduled(text, read))._replace(at_ns=at_ns)
+
+
+def _scheduled(text: str, read: ReadText | None) -> Action:
+    action = parse_action(text, read)
+    if action.verb not in STREAM_VERBS:
+        raise ValueError(f"{action.verb} cannot be scheduled; a timeline can {', '.join(STREAM_VERBS)}")
+    return action
 
 
 def _text_of(path: Path) -> str:

@@ -216,7 +216,6 @@ do = enable 101
      disable S1
 [at 3]
 do = fault "N1" loss=none
-     pause
 """
 
 
@@ -234,7 +233,6 @@ def test_timeline() -> None:
         "fault",
         "fault",
         "fault",
-        "pause",
     ]
 
 

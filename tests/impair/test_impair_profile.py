@@ -43,7 +43,7 @@ duplicate = none
 do = disable N1
      fault N2 loss=5%
 [at 3]
-do = pause
+do = enable N1
 """
 
 
@@ -56,7 +56,7 @@ def test_rules_apply_in_order() -> None:
     assert other == type(other)()
     assert profile.stages(["X", "101"]) == one
     assert [(action.at_ns, action.verb) for action in profile.timeline] == [
-        (3_000_000_000, "pause"),
+        (3_000_000_000, "enable"),
         (12_500_000_000, "disable"),
         (12_500_000_000, "fault"),
     ]
@@ -135,6 +135,10 @@ def test_numbers_from_a_file(tmp_path: Path) -> None:
         ("[run]\nseed = -5", "p.ini:2: [run] seed: -5 is out of range; it must be 0 to 1.84467e+19"),
         ("[at noon]\ndo = pause", "p.ini:1: [at noon]: 'noon' is not a number; write [at SECONDS]"),
         ("[at 5]", "p.ini:1: [at 5]: nothing to do; add a line 'do = disable NAME'"),
+        (
+            "[at 5]\ndo = disable N1\n     pause",
+            "p.ini:2: [at 5] do: pause cannot be scheduled; a timeline can enable, disable, fault",
+        ),
         ("[at 5]\ndp = pause", "p.ini:2: [at 5] dp: unknown key; known: do"),
         ("[at 5]\ndo = disabel N1", "p.ini:2: [at 5] do: 'disabel' is nothing to do; did you mean 'disable'?"),
         ("[at 5]\ndo = disable", "p.ini:2: [at 5] do: disable whom? write 'disable NAME'"),
