@@ -118,7 +118,9 @@ class Senders:
         SourceError for an unknown host or a source that is not local, SettingsError for an endpoint that is served.
         """
         if endpoint.scheme is not Scheme.UDP:
-            raise SettingsError(f"{endpoint}: {endpoint.scheme}:// is served to those who connect; use --listen for it")
+            raise SettingsError(
+                f"{endpoint}: {endpoint.scheme}:// is served to those who connect; listen there instead"
+            )
         if not endpoint.port:
             raise SettingsError(f"{endpoint}: port 0 is nowhere to send to")
         where = target(resolve(scoped(endpoint.host, endpoint.iface), endpoint.port, datagram=True))
@@ -136,15 +138,13 @@ class Senders:
         Raises SourceError where the port is taken or not permitted, SettingsError for two streams of one IDCODE.
         """
         if endpoint.scheme is Scheme.UDP:
-            raise SettingsError(f"{endpoint}: udp:// knows no commands; use udp+cmd://, or send to it with --to")
+            raise SettingsError(f"{endpoint}: udp:// knows no commands; use udp+cmd://, or send to it unasked")
         offered: dict[int, Served] = {}
         handles: dict[int, int] = {}
         for handle in streams:
             stream = self._served[handle]
             if stream.idcode in offered:
-                raise SettingsError(
-                    f"{endpoint}: two streams of IDCODE {stream.idcode}; renumber one (--idcode OLD=NEW)"
-                )
+                raise SettingsError(f"{endpoint}: two streams of IDCODE {stream.idcode}; renumber one")
             offered[stream.idcode] = stream
             handles[stream.idcode] = handle
         number = len(self._outlets)

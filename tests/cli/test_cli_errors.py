@@ -53,7 +53,7 @@ MISTAKES = [
     ("read udp://127.0.0.1:0 --duration 1", 2, "--out"),
     # an address
     ("play good.pcap", 2, "where to? give --to udp://HOST:PORT or --listen tcp://HOST:PORT"),
-    ("play good.pcap --to tcp://127.0.0.1:4712", 2, "use --listen"),
+    ("play good.pcap --to tcp://127.0.0.1:4712", 2, "listen there instead"),
     ("play good.pcap --listen udp://127.0.0.1:4712", 2, "use udp+cmd://, or send to it unasked"),
     ("play good.pcap --to 127.0.0.1:4712", 2, "no endpoint URL; write tcp://127.0.0.1:4712"),
     ("play good.pcap --to foo://127.0.0.1:4712", 2, "unknown scheme 'foo'; use one of udp://"),
@@ -149,7 +149,7 @@ def test_two_streams_of_one_idcode_cannot_be_listened_to(pmu: Pmu) -> None:
         assert pmu("convert", "good.pcap", name, "--idcode", 101).code == 0
     result = pmu("play", "one.csv", "two.csv", "--listen", "tcp://127.0.0.1:0")
     assert result.code == 2
-    assert "two streams of IDCODE 101" in result.complaint
+    assert "N1 and N1#2 both have IDCODE 101; choose one with --select or --exclude" in result.complaint
 
 
 def test_a_capture_of_something_else_holds_no_frames(pmu: Pmu, foreign: Path) -> None:

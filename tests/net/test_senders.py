@@ -535,7 +535,7 @@ def test_what_cannot_be_served_is_told() -> None:
             senders.listen(parse_endpoint(f"tcp://127.0.0.1:{server.address[1]}"), server.handles)
         with pytest.raises(SettingsError, match="knows no commands; use udp\\+cmd://"):
             senders.listen(parse_endpoint("udp://127.0.0.1:0"), server.handles)
-        with pytest.raises(SettingsError, match="use --listen"):
+        with pytest.raises(SettingsError, match="listen there instead"):
             senders.send_to(parse_endpoint("tcp://127.0.0.1:4712"), server.handles)
         with pytest.raises(SettingsError, match="port 0"):
             senders.send_to(parse_endpoint("udp://127.0.0.1:0"), server.handles)
