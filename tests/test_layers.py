@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,13 @@ CODEC = [
 """Inside the codec, lowest first."""
 NO_CLOCK = ["pmutools.c37118", "pmutools.impair", "pmutools.grid", "pmutools.modal", "dcon.core", "dcon.limiter"]
 EDGES = {"time", "socket", "select", "selectors", "threading", "subprocess", "asyncio"}
+
+
+def test_packages_offer_what_they_have() -> None:
+    for name in ("pmutools.c37118", "pmutools.formats", "pmutools.impair", "pmutools.schema", "pmutools.net"):
+        package = import_module(name)
+        missing = [offered for offered in getattr(package, "__all__", ()) if not hasattr(package, offered)]
+        assert not missing, f"{name} offers {missing}"
 
 
 def modules() -> Iterator[tuple[str, Path]]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
     from pmutools.formats.source import Source
 
-__all__ = ["FORMATS", "FileFormat", "Sink", "SinkOptions", "Source", "open_sink", "open_source"]
+__all__ = ["FORMATS", "FileFormat", "Sink", "SinkOptions", "open_sink", "open_source"]
 
 COMPRESSIONS = (".gz", ".zst")
 _COMPRESSED = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")

@@ -94,11 +94,11 @@ MESSAGES: dict[str, MessageType] = {
     ),
     "Event": MessageType(
         "/dcon/event",
-        "Something that happened at a tick: a change of state, a switch, a check that fired or cleared.",
+        "Something that happened at a tick: a change of state, a switch, a check that fired.",
         (
             _TICK,
             Field("name", "string", "What happened."),
-            Field("subject", "string", "To whom: a PMU, an instance, or empty for the whole controller."),
+            Field("subject", "string", 'To whom: a PMU, an instance, or "system" for the whole controller.'),
             Field("detail", "string", "Value, limit, or words for the operator."),
         ),
     ),
