@@ -15,7 +15,7 @@ from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, MODE_IS_FREE, ORDERS, PERMISSIVES, TRANSITIONS, Trigger
 from dcon.core.values import SystemState
 from dcon.drivers import udp_command
-from dcon.settings import Log, Output, Platform, Site
+from dcon.settings import FROM_SITES, Log, Output, Platform, Site
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
@@ -179,7 +179,7 @@ GENERATORS = {
     "instance-diagram": lambda: diagram(instance.TRANSITIONS, "DISABLED"),
     "permissives": permissives,
     "checks": checks,
-    "settings-controller": lambda: numbers(Params, ("pmus", "instances", "thresholds")),
+    "settings-controller": lambda: numbers(Params, FROM_SITES),
     "settings-supervisor": lambda: numbers(Thresholds),
     "settings-pmu": lambda: keys(Site),
     "settings-output": lambda: keys(Output),
