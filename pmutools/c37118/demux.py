@@ -209,6 +209,13 @@ class Demux:
         state = self._flows.get(flow)
         return {idcode: held.nbytes for idcode, held in state.held.items()} if state else {}
 
+    def ignore(self, flow: Flow, idcode: int) -> None:
+        """Give up what is held of a stream that nobody wants; its bytes count as ignored."""
+        state = self._flows.get(flow)
+        if state is not None and (held := state.held.pop(idcode, None)) is not None:
+            self._waiting.get((state.host, idcode), {}).pop(flow, None)
+            self.tally.ignored += held.nbytes
+
     def _end(self, state: _FlowState, out: list[Message | Loss]) -> None:
         for item in state.framer.close():
             self._take(state, item, out)

@@ -18,6 +18,7 @@ from pmutools.errors import SettingsError
 
 if TYPE_CHECKING:
     from pmutools.impair.profile import Profile
+    from pmutools.net.endpoint import Endpoint
     from pmutools.tools.player.play import StreamResult
     from pmutools.tools.window import Moment
 
@@ -117,8 +118,8 @@ def command(
     if fps is not None and stamp == StampPolicy.KEEP:
         raise SettingsError("--fps makes new stamps, --stamp keep keeps the old: leave one out")
     options = Options(
-        to=[parse_endpoint(url) for url in to],
-        listen=[parse_endpoint(url) for url in listen],
+        to=[_sent_to(parse_endpoint(url)) for url in to],
+        listen=[_listening(parse_endpoint(url)) for url in listen],
         policy=StampPolicy(stamp),
         speed=speed,
         interval_ns=interval_ns,
@@ -161,6 +162,18 @@ def command(
     if stopped:
         return Exit.INTERRUPTED
     return Exit.INCOMPLETE if lost else Exit.DONE
+
+
+def _sent_to(endpoint: Endpoint) -> Endpoint:
+    if endpoint.scheme.commanded:
+        raise SettingsError(f"--to {endpoint}: that is served to those who connect; give --listen {endpoint}")
+    return endpoint
+
+
+def _listening(endpoint: Endpoint) -> Endpoint:
+    if not endpoint.scheme.commanded:
+        raise SettingsError(f"--listen {endpoint}: udp:// knows no commands; give --to, or udp+cmd://")
+    return endpoint
 
 
 def _told(result: StreamResult) -> str:

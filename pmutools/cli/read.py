@@ -55,12 +55,12 @@ def command(
     if as_json and out != "-":
         click.echo(json.dumps(reading.to_json() | {"paths": paths}))
     talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {', '.join(paths) or 'nothing written'}")
-    for reason, nbytes in reading.tally.skipped.items():
+    for reason, nbytes in reading.skipped.items():
         talk.say(f"  {nbytes} bytes skipped: {reason}")
     if reading.own_drops:
         talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
     if stopped:
         return Exit.INTERRUPTED
-    if not reading.frames and not reading.tally.skipped:
+    if not reading.frames and not reading.skipped:
         raise SourceError(f"no data came from {', '.join(urls)}; is the sender on, and the port and IDCODE right?")
-    return Exit.INCOMPLETE if reading.tally.skipped or reading.own_drops else Exit.DONE
+    return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE

@@ -175,6 +175,15 @@ class Receivers:
             self._look_at_held(item.flow, now_ns)
         return out
 
+    def finish(self) -> list[Message | Loss]:
+        """The end: what of wanted streams was pending. Own drops not yet told come with the next :meth:`poll`."""
+        self._look_for_drops()
+        return [
+            part
+            for part in self.demux.close()
+            if isinstance(part, Loss) or self._route(part.flow, part.frame.idcode) is not None
+        ]
+
     def owners(self, flow: Flow, idcode: int) -> tuple[int, ...]:
         """The places of the endpoints that a stream belongs to."""
         route = self._route(flow, idcode)
@@ -304,7 +313,11 @@ class Receivers:
         """Data frames that fit no configuration do not come out of the demultiplexer; notice them all the same."""
         for idcode, nbytes in self.demux.held(flow).items():
             before = self._held.get((flow, idcode))
-            if nbytes == before or (route := self._route(flow, idcode)) is None:
+            if nbytes == before:
+                continue
+            if (route := self._route(flow, idcode)) is None:
+                self.unwanted += 1
+                self.demux.ignore(flow, idcode)
                 continue
             self._held[flow, idcode] = nbytes
             if before is None:
@@ -330,6 +343,10 @@ class Receivers:
     # --- telling
 
     def _keep_house(self) -> None:
+        self._look_for_drops()
+        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
+
+    def _look_for_drops(self) -> None:
         for listener in self._listeners.values():
             drops = listener.sock.own_drops
             if drops is not None and drops != listener.drops:
@@ -338,7 +355,6 @@ class Receivers:
                 where = f"udp://{listener.sock.address}"
                 detail = "this machine's receive buffer was full"
                 self._out.append(LinkEvent(LinkKind.OWN_DROPS, where, listener.owners, detail, datagrams=lost))
-        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
 
     def _tell_of_nothing(self) -> None:
         for index, endpoint in enumerate(self.endpoints):

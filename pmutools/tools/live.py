@@ -14,6 +14,7 @@ from pmutools.formats.source import Block, gather
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.net.receiver import Receivers
+from pmutools.net.sockets import RCVBUF_BYTES
 
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
@@ -38,11 +39,12 @@ class LiveSource:
         tell: Callable[[LinkEvent], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
         clock: Clock | None = None,
+        rcvbuf_bytes: int = RCVBUF_BYTES,
     ) -> None:
         endpoints = [parse_endpoint(url) if isinstance(url, str) else url for url in urls]
         self.path = Path(str(endpoints[0]) if len(endpoints) == 1 else f"{len(endpoints)} endpoints")
         self.clock = clock or SystemClock()
-        self.receivers = Receivers(endpoints, self.clock, configs=configs)
+        self.receivers = Receivers(endpoints, self.clock, configs=configs, rcvbuf_bytes=rcvbuf_bytes)
         self.tally = self.receivers.demux.tally
         self.own_drops = 0
         """Datagrams lost in this machine's receive buffers: not the network's doing."""
@@ -59,17 +61,22 @@ class LiveSource:
         self.receivers.close()
 
     def polls(self) -> Iterator[list[Message | Loss]]:
-        """What came, poll by poll, an empty list at least every 0.1 s; the last one holds what was pending."""
+        """What came, poll by poll, an empty list at least every 0.1 s; the last ones hold what was pending."""
         while (left_ns := self._left_ns()) > 0 and not self._stop():
-            found: list[Message | Loss] = []
-            for item in self.receivers.poll(min(POLL_NS, left_ns)):
-                if not isinstance(item, Chunk):
-                    self.own_drops += item.datagrams
-                    if self._tell is not None:
-                        self._tell(item)
-                found += self.receivers.parse(item)
-            yield found
-        yield self.receivers.demux.close()
+            yield self._poll(min(POLL_NS, left_ns))
+        yield self._poll(0)
+        yield self.receivers.finish()
+        yield self._poll(0)  # the news of the end
+
+    def _poll(self, timeout_ns: int) -> list[Message | Loss]:
+        found: list[Message | Loss] = []
+        for item in self.receivers.poll(timeout_ns):
+            if not isinstance(item, Chunk):
+                self.own_drops += item.datagrams
+                if self._tell is not None:
+                    self._tell(item)
+            found += self.receivers.parse(item)
+        return found
 
     def items(self) -> Iterator[Message | Loss]:
         for found in self.polls():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,6 +24,8 @@ class Reading:
     tally: Tally
     frames: int = 0
     streams: set[tuple[object, int]] = field(default_factory=set)
+    skipped: Counter[str] = field(default_factory=Counter)
+    """Bytes that are in no frame, by reason."""
     own_drops: int = 0
 
     def to_json(self) -> dict[str, Any]:
@@ -30,15 +33,15 @@ class Reading:
             "frames": self.frames,
             "streams": len(self.streams),
             "bytes": self.tally.fed,
-            "skipped": {str(reason): nbytes for reason, nbytes in self.tally.skipped.items()},
+            "skipped": dict(self.skipped),
             "own_drops": self.own_drops,
         }
 
 
 def read(source: LiveSource, sink: Sink, progress: Callable[[Reading], None] | None = None) -> Reading:
-    """Read ``source`` to its end into ``sink``. What has come is kept on KeyboardInterrupt too, which then passes on.
+    """Read ``source`` to its end into ``sink``; ``progress`` is called about once a second.
 
-    ``progress`` is called about once a second.
+    What has come is kept on an error too, which then passes on.
     """
     reading = Reading(source.tally)
     gatherer = Gatherer()
@@ -61,6 +64,7 @@ def read(source: LiveSource, sink: Sink, progress: Callable[[Reading], None] | N
 
 def _take(item: Message | Loss, sink: Sink, gatherer: Gatherer, reading: Reading) -> None:
     if isinstance(item, Loss):
+        reading.skipped[str(item.skipped.reason)] += item.skipped.nbytes
         return
     data = item.frame.type is FrameType.DATA
     if data:

@@ -53,8 +53,8 @@ MISTAKES = [
     ("read udp://127.0.0.1:0 --duration 1", 2, "--out"),
     # an address
     ("play good.pcap", 2, "where to? give --to udp://HOST:PORT or --listen tcp://HOST:PORT"),
-    ("play good.pcap --to tcp://127.0.0.1:4712", 2, "listen there instead"),
-    ("play good.pcap --listen udp://127.0.0.1:4712", 2, "use udp+cmd://, or send to it unasked"),
+    ("play good.pcap --to tcp://127.0.0.1:4712", 2, "give --listen tcp://127.0.0.1:4712"),
+    ("play good.pcap --listen udp://127.0.0.1:4712", 2, "udp:// knows no commands; give --to, or udp+cmd://"),
     ("play good.pcap --to 127.0.0.1:4712", 2, "no endpoint URL; write tcp://127.0.0.1:4712"),
     ("play good.pcap --to foo://127.0.0.1:4712", 2, "unknown scheme 'foo'; use one of udp://"),
     ("play good.pcap --to udp://127.0.0.1", 2, "no port; C37.118 customarily has udp://127.0.0.1:4713"),

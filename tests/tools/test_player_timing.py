@@ -56,7 +56,8 @@ def test_no_drift_over_an_hour(rate: int, speed: str) -> None:
     played = play(recording(stream(rate=rate), count, slots=slots), clock=clock(), speed=speed)
     first = played.script.first_due_ns
     expected = [int(slot_time_ns(rate * (START_NS // NS) + s, Fraction(rate)) // 1000 * 1000 - first) for s in slots]
-    offsets = [time - played.times()[0] for time in played.times()]
+    times = played.times()
+    offsets = [time - times[0] for time in times]
     for offset, stream_ns in zip(offsets, expected, strict=True):
         assert abs(offset - stream_ns / Fraction(speed)) <= 1000 / Fraction(speed) + 1, "TIME_BASE is 1 us"
     assert played.player.results[0].lateness.max_ns == 0

@@ -112,7 +112,7 @@ class Player:
             for endpoint in options.to:
                 self.senders.send_to(endpoint, self._picked(endpoint))
             for endpoint in options.listen:
-                self.senders.listen(endpoint, self._picked(endpoint))
+                self.senders.listen(endpoint, self._told_apart(endpoint, self._picked(endpoint)))
         except BaseException:
             self.senders.close()
             raise
@@ -125,6 +125,16 @@ class Player:
             there = ", ".join(str(stream.config.idcode) for stream in streams)
             raise SettingsError(f"{endpoint}: no stream of IDCODE {endpoint.idcode}; there are {there}")
         return chosen
+
+    def _told_apart(self, endpoint: Endpoint, handles: list[int]) -> list[int]:
+        """``handles``, if commands can tell their streams apart."""
+        names: dict[int, str] = {}
+        for handle in handles:
+            stream = self.script.streams[handle]
+            if (other := names.setdefault(stream.config.idcode, stream.name)) != stream.name:
+                both = f"{other} and {stream.name} both have IDCODE {stream.config.idcode}"
+                raise SettingsError(f"--listen {endpoint}: {both}; choose one with --select or --exclude")
+        return handles
 
     def play(self, ledger: LedgerWriter | None = None) -> None:
         """Play to the end, or for ``duration_ns``. With ``listen`` only, begins at the first start command."""
