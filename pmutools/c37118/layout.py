@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from pmutools.c37118.config import PhasorChannel, Station, StreamConfig
-from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, Format
+from pmutools.c37118.constants import PREFIX_SIZE, Format
 
 if TYPE_CHECKING:
     import numpy as np
@@ -262,16 +262,3 @@ def dtype_of(config: StreamConfig) -> np.dtype[np.void]:
     dtype: np.dtype[np.void] = np.dtype([*head, *blocks, ("chk", ">u2")])
     assert dtype.itemsize == config.frame_size
     return dtype
-
-
-def field_at(config: StreamConfig, name: str, station: int = 0) -> Field:
-    """The :class:`Field` called ``name``: a prefix field, ``chk``, or one of a station's; KeyError where absent."""
-    for field in PREFIX_FIELDS:
-        if field.name == name:
-            return field
-    if name == "chk":
-        return Field("chk", "H", 1, 1, config.frame_size - CHK_SIZE, -1)
-    for field in layout_of(config).stations[station]:
-        if field.name == name:
-            return field
-    raise KeyError(name)

@@ -62,7 +62,8 @@ class LogWriter:
 
     def checkpoint(self, now_ns: int) -> None:
         """Say that nothing written later belongs to what was written before; flushes once a second of log time."""
-        if self._chunk_start_ns is not None and now_ns - self._chunk_start_ns >= CHUNK_NS:
+        # a clock set back must not put the flush off
+        if self._chunk_start_ns is not None and abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
             self.flush()
 
     def flush(self) -> None:
