@@ -9,7 +9,6 @@ said of what the grid would have done.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -124,7 +123,9 @@ def identical(one: object, other: object) -> bool:
     if isinstance(one, complex) and isinstance(other, complex):
         one, other = (one.real, one.imag), (other.real, other.imag)
     if isinstance(one, float) and isinstance(other, float):
-        return struct.pack("<d", one) == struct.pack("<d", other) or (math.isnan(one) and math.isnan(other))
+        if one == other:
+            return one != 0 or math.copysign(1, one) == math.copysign(1, other)
+        return math.isnan(one) and math.isnan(other)
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(map(identical, one, other))
     return one == other
