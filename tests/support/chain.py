@@ -25,6 +25,7 @@ from pmutools.formats import open_sink, open_source
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.timebase import NS
 from pmutools.tools.live import LiveSource
+from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
 from pmutools.tools.player.script import study
 from pmutools.tools.reader import Reading, read
@@ -47,13 +48,14 @@ class EarlyClock(SystemClock):
 
 
 @contextmanager
-def playing(player: Player, over: threading.Event) -> Iterator[threading.Thread]:
+def playing(player: Player, over: threading.Event, ledger: LedgerWriter | None = None) -> Iterator[threading.Thread]:
     """Play in a thread of its own; what goes wrong there fails the test. ``over`` is what tells the player to stop."""
     errors: list[BaseException] = []
 
     def run() -> None:
         try:
-            player.play()
+            with ledger or contextlib.nullcontext():
+                player.play(ledger)
         except BaseException as error:
             errors.append(error)
 
