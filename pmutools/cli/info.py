@@ -32,9 +32,9 @@ def command(target: str, duration_ns: int | None, as_json: bool, quiet: bool, ve
         duration_ns = LIVE_NS
     with open_target(target, duration_ns) as source:
         inventory = take_inventory(source)
-    if not inventory.frames:
+    if not inventory.frames and not inventory.skipped:
         talk.complain(f"pmu info: {target}: no C37.118 frames found in {inventory.bytes_in} bytes of payload")
-        return Exit.INCOMPLETE if inventory.skipped else Exit.FAILED
+        return Exit.FAILED
     if as_json:
         json.dump(inventory.to_json(), sys.stdout, indent=2)
         sys.stdout.write("\n")

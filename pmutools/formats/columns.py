@@ -206,11 +206,11 @@ def _words(values: Floats) -> npt.NDArray[np.uint16]:
 def _turn_to_complex(out: npt.NDArray[np.complex128], found: Mapping[str, Floats]) -> None:
     """Fill ``out`` from magnitudes and degrees where it has no rectangular value; multiples of 90° come out exact."""
     magnitude, degrees = found["mag"], found["deg"]
-    quarters = np.rint(degrees / 90.0)
-    rest = np.radians(degrees - 90.0 * quarters)
-    cosine, sine = np.cos(rest), np.sin(rest)
-    turn = [quarters % 4 == k for k in range(4)]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # infinities, and NaN that signals
+        quarters = np.rint(degrees / 90.0)
+        rest = np.radians(degrees - 90.0 * quarters)
+        cosine, sine = np.cos(rest), np.sin(rest)
+        turn = [quarters % 4 == k for k in range(4)]
         real = magnitude * np.select(turn, [cosine, -sine, -cosine, sine], np.nan)
         imag = magnitude * np.select(turn, [sine, cosine, -sine, -cosine], np.nan)
     missing = np.isnan(out.real) & np.isnan(out.imag)

@@ -168,7 +168,7 @@ def data_rate_of(time_ns: npt.NDArray[np.int64]) -> int | None:
     steps = np.diff(np.unique(time_ns))
     if not len(steps):
         return None
-    usual = np.median(steps)
+    usual = np.sort(steps)[(len(steps) - 1) // 2]  # the lower median: one that occurs
     period_s = float(steps[np.abs(steps - usual) <= usual / 2].mean()) / NS
     if period_s > 1.5:
         return -min(round(period_s), 0x7FFF)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,6 +63,19 @@ class Pmu:
             signal.signal(signal.SIGINT, interrupted)
         out, err = self._capture.readouterr()
         return Result(code, out, err)
+
+
+def run_here(*arguments: object) -> Result:
+    """``pmu`` in this process, without a fixture: for many runs in one test. Standard output is text only."""
+    out, err = io.StringIO(), io.StringIO()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            code = run(pmu_group(), [str(argument) for argument in arguments])
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return Result(code, out.getvalue(), err.getvalue())
 
 
 def command(*arguments: object) -> list[str]:
