@@ -80,11 +80,12 @@ def format_text(fmt: Format) -> str:
 
 def remarks(stream: StreamInventory) -> list[str]:
     """What an engineer should know about the stream, in words; empty for a clean one."""
-    frames = stream.frames
+    frames, slots = stream.frames, stream.slots
     found = [
-        (stream.missing, f"{stream.missing} frames missing in {stream.gaps} gaps"),
-        (stream.duplicates, f"{stream.duplicates} frames repeat a time stamp"),
-        (stream.backwards, f"{stream.backwards} stamps go backwards"),
+        (slots.missing, f"{slots.missing} frames missing in {slots.gaps} gaps"),
+        (slots.duplicates, f"{slots.duplicates} frames repeat a time stamp"),
+        (slots.reordered, f"{slots.reordered} frames came after later ones"),
+        (slots.backwards, f"{slots.backwards} stamps go backwards"),
         (stream.off_grid, f"{stream.off_grid} stamps are off the {float(stream.config.rate):g}/s grid"),
         (stream.config_changes, f"{stream.config_changes} configuration changes"),
         (stream.data_error, f"STAT says data error in {stream.data_error} of {frames} frames"),

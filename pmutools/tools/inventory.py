@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.source import Block, Source
 from pmutools.tools.describe import describe_station
+from pmutools.tools.slots import SlotCounts
 
 OFF_GRID_SHARE = 0.1
 """A stamp further than this share of a period from its reporting instant is off the grid."""
@@ -34,21 +34,18 @@ class StreamInventory:
     last_ns: int = 0
     first_arrival_ns: int | None = None
     last_arrival_ns: int | None = None
-    gaps: int = 0
-    missing: int = 0
-    duplicates: int = 0
-    backwards: int = 0
+    slots: SlotCounts = field(default_factory=SlotCounts)
     off_grid: int = 0
     data_error: int = 0
     not_synchronised: int = 0
     invalid: int = 0
     time_quality: dict[int, int] = field(default_factory=dict)
-    _last_slot: int | None = None
 
     def add(self, batch: Batch) -> None:
         """Count a batch that follows all before it."""
         if batch.config != self.config:
-            self.config, self.config_changes, self._last_slot = batch.config, self.config_changes + 1, None
+            self.config, self.config_changes = batch.config, self.config_changes + 1
+            self.slots.restart()
         if not self.frames:
             self.first_ns = int(batch.time_ns[0])
         self.frames += len(batch)
@@ -62,20 +59,10 @@ class StreamInventory:
         self.invalid += int(np.count_nonzero(~batch.valid.all(axis=1)))
         for code, count in zip(*np.unique(batch.time_quality & 0xF, return_counts=True), strict=True):
             self.time_quality[int(code)] = self.time_quality.get(int(code), 0) + int(count)
-        if self.config.rate:
-            self._count_slots(batch, self.config.rate)
-
-    def _count_slots(self, batch: Batch, rate: Fraction) -> None:
-        slots = timebase.slots_array(batch.time_ns, rate)
-        before = slots[:1] - 1 if self._last_slot is None else np.array([self._last_slot])
-        steps = np.diff(np.concatenate((before, slots)))
-        self.gaps += int(np.count_nonzero(steps > 1))
-        self.missing += int((steps[steps > 1] - 1).sum())
-        self.duplicates += int(np.count_nonzero(steps == 0))
-        self.backwards += int(np.count_nonzero(steps < 0))
-        limit_ns = OFF_GRID_SHARE * timebase.NS / float(rate)
-        self.off_grid += int(np.count_nonzero(np.abs(timebase.grid_offset_array(batch.time_ns, rate)) > limit_ns))
-        self._last_slot = int(slots[-1])
+        if rate := self.config.rate:
+            self.slots.add(timebase.slots_array(batch.time_ns, rate))
+            limit_ns = OFF_GRID_SHARE * timebase.NS / float(rate)
+            self.off_grid += int(np.count_nonzero(np.abs(timebase.grid_offset_array(batch.time_ns, rate)) > limit_ns))
 
     @property
     def measured_hz(self) -> float | None:
@@ -104,10 +91,11 @@ class StreamInventory:
             "span_s": (self.last_ns - self.first_ns) / timebase.NS,
             "first_arrival_ns": self.first_arrival_ns,
             "last_arrival_ns": self.last_arrival_ns,
-            "gaps": self.gaps,
-            "missing": self.missing,
-            "duplicates": self.duplicates,
-            "backwards": self.backwards,
+            "gaps": self.slots.gaps,
+            "missing": self.slots.missing,
+            "duplicates": self.slots.duplicates,
+            "reordered": self.slots.reordered,
+            "backwards": self.slots.backwards,
             "off_grid": self.off_grid,
             "config_changes": self.config_changes,
             "data_error": self.data_error,
