@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pmutools.cli.shell import Exit, Talk, common
-from pmutools.cli.sources import DURATION, END, IDCODES, START, spare
+from pmutools.cli.sources import DURATION, END, IDCODES, START, Watched, spare
 
 if TYPE_CHECKING:
     from pmutools.tools.window import Moment
@@ -51,7 +51,7 @@ def command(
     window = Window(start, end, duration_ns, idcodes)
     source = open_recordings(inputs)
     with open_sink(output, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
-        result = convert(source, sink, window)
+        result = convert(Watched(source, talk), sink, window)
     paths = [str(path) for path in sink.paths]
     if as_json and output != "-":
         click.echo(json.dumps(result.to_json() | {"paths": paths}))

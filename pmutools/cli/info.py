@@ -7,7 +7,7 @@ import sys
 import click
 
 from pmutools.cli.shell import Exit, Talk, common
-from pmutools.cli.sources import DURATION, TARGET, open_target
+from pmutools.cli.sources import DURATION, TARGET, Watched, open_target
 from pmutools.timebase import NS
 
 LIVE_NS = 5 * NS
@@ -31,7 +31,7 @@ def command(target: str, duration_ns: int | None, as_json: bool, quiet: bool, ve
     if duration_ns is None and "://" in target:
         duration_ns = LIVE_NS
     with open_target(target, duration_ns) as source:
-        inventory = take_inventory(source)
+        inventory = take_inventory(Watched(source, talk))
     if not inventory.frames and not inventory.skipped:
         talk.complain(f"pmu info: {target}: no C37.118 frames found in {inventory.bytes_in} bytes of payload")
         return Exit.FAILED

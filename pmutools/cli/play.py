@@ -13,7 +13,7 @@ import click
 
 from pmutools import parsers
 from pmutools.cli.shell import Exit, F, Parsed, Talk, common, interruptible
-from pmutools.cli.sources import DURATION, END, START, spare
+from pmutools.cli.sources import DURATION, END, START, Watched, spare
 from pmutools.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def command(
     if ledger is not None:
         spare(ledger, files)
     source = open_recordings(files)
-    script = study(source.items(), timing, Window(start, end), select, exclude)
+    script = study(Watched(source, talk).items(), timing, Window(start, end), select, exclude)
     lost = losses(source)
     for pattern in options.profile.unmatched(stream.names for stream in script.streams):
         talk.say(f"no stream is called {pattern!r}; there are {', '.join(stream.name for stream in script.streams)}")
@@ -151,7 +151,7 @@ def command(
         for url in (*to, *listen):
             talk.say(f"{len(script.streams)} streams, {sum(s.frames for s in script.streams)} data frames: {url}")
         with LedgerWriter(ledger) if ledger is not None else nullcontext() as rows:
-            player.play(rows)
+            player.play(rows, lambda sent: talk.progress(f"{sent} frames sent"))
         stopped = stop()
     if as_json:
         click.echo(json.dumps({"streams": [result.to_json() for result in player.results], "losses": lost}))

@@ -95,11 +95,11 @@ class Talk:
         click.echo(visible(text), err=True)
 
     def progress(self, text: str) -> None:
-        """A line that the next one overwrites; only where a person is watching."""
+        """A line that the next one overwrites, and an empty one removes; only where a person is watching."""
         if not self.quiet and sys.stderr.isatty():
             self._clear()
             click.echo(visible(text), err=True, nl=False)
-            self._shown = True
+            self._shown = bool(text)
 
     def _clear(self) -> None:
         if self._shown:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from pmutools import parsers
-from pmutools.cli.shell import Parsed
+from pmutools.cli.shell import Parsed, Talk
 from pmutools.errors import SettingsError
 from pmutools.timebase import NS
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from pmutools.formats.source import Block, Source
     from pmutools.tools.window import Moment
 
+T = TypeVar("T")
+TOLD_FRAMES = 10_000
 TARGET = str
 """A path, or an endpoint URL."""
 
@@ -65,24 +67,58 @@ def open_target(target: str, duration_ns: int | None) -> Iterator[Source]:
     yield source if duration_ns is None else _Cut(source, duration_ns)
 
 
-class _Cut:
+class _Through:
+    """A source seen through something; ``tally``, ``defects`` and the like are its own."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+
+class _Cut(_Through):
     """A source whose data frames end ``duration_ns`` after the first."""
 
     def __init__(self, source: Source, duration_ns: int) -> None:
-        self._source, self._duration_ns = source, duration_ns
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._source, name)
+        super().__init__(source)
+        self._duration_ns = duration_ns
 
     def items(self) -> Iterator[Message | Loss]:
         from pmutools.tools.window import Window
 
-        return Window(duration_ns=self._duration_ns).items(self._source.items())
+        return Window(duration_ns=self._duration_ns).items(self.source.items())
 
     def blocks(self) -> Iterator[Block | Message | Loss]:
         from pmutools.tools.window import Window
 
-        return Window(duration_ns=self._duration_ns).blocks(self._source.blocks())
+        return Window(duration_ns=self._duration_ns).blocks(self.source.blocks())
+
+
+class Watched(_Through):
+    """A source whose progress is shown while it is read."""
+
+    def __init__(self, source: Source, talk: Talk) -> None:
+        super().__init__(source)
+        self._talk = talk
+
+    def items(self) -> Iterator[Message | Loss]:
+        return self._watched(self.source.items())
+
+    def blocks(self) -> Iterator[Block | Message | Loss]:
+        return self._watched(self.source.blocks())
+
+    def _watched(self, items: Iterator[T]) -> Iterator[T]:
+        frames = told = 0
+        try:
+            for item in items:
+                yield item
+                frames += len(item.batch) if hasattr(item, "batch") else 1
+                if frames >= told + TOLD_FRAMES:
+                    told = frames
+                    self._talk.progress(f"{self.source.path}: {frames} frames")
+        finally:
+            self._talk.progress("")
 
 
 def spare(output: str | Path, inputs: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ import click
 
 from pmutools import parsers
 from pmutools.cli.shell import Parsed, Talk, common
+from pmutools.cli.sources import Watched
 from pmutools.errors import SettingsError
 
 
@@ -51,7 +52,8 @@ def command(
         raise SettingsError("--pdc: at most 100 PMUs in one stream")
     messages = synthesise(Recipe(scenario_name, plant, pmus, rate, duration, seed, pdc))
     with open_sink(output) as sink:
-        result = convert(MessageSource(Path(scenario_name), "synth", messages), sink, Window())
+        source = MessageSource(Path(scenario_name), "synth", messages)
+        result = convert(Watched(source, talk), sink, Window())
     paths = [str(path) for path in sink.paths]
     if as_json:
         click.echo(json.dumps(result.to_json() | {"paths": paths}))

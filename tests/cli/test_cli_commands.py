@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.captures import PMU, tcp_packets, udp_packet, write_pcap
-from support.commands import Pmu, run_pmu
+from support.commands import Pmu, command, run_pmu
 from support.playing import START_NS, interleaved, recording, stream
 from support.recordings import write
 
@@ -50,9 +53,6 @@ def test_help_of_every_command_is_complete_and_in_columns(pmu: Pmu) -> None:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    import subprocess
-    import sys
-
     program = (
         "import sys\nfrom pmutools.cli import pmu\nfrom pmutools.cli.shell import run\n"
         "for name in ('play', 'read', 'info', 'dump', 'convert', 'synth'):\n"
@@ -316,6 +316,22 @@ def test_faults_that_were_asked_for_are_no_failure(pmu: Pmu, small: Path, tmp_pa
 
 
 # --- everywhere
+
+
+def test_progress_is_shown_where_a_person_watches_and_removed(tmp_path: Path) -> None:
+    pty = pytest.importorskip("pty")
+    path = tmp_path / "long.c37118"
+    write(path, recording(stream(rate=120), 25_000))
+    person, terminal = pty.openpty()
+    try:
+        words = command("info", path, "--json")
+        subprocess.run(words, stdout=subprocess.DEVNULL, stderr=terminal, timeout=60, check=True)
+        shown = os.read(person, 1 << 16).decode()
+    finally:
+        os.close(person)
+        os.close(terminal)
+    assert shown.startswith(f"{path}: ")
+    assert shown.endswith(" frames\r\x1b[K")
 
 
 def test_quiet_commands_say_nothing(pmu: Pmu, small: Path, tmp_path: Path) -> None:

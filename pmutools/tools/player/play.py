@@ -136,9 +136,13 @@ class Player:
                 raise SettingsError(f"--listen {endpoint}: {both}; choose one with --select or --exclude")
         return handles
 
-    def play(self, ledger: LedgerWriter | None = None) -> None:
-        """Play to the end, or for ``duration_ns``. With ``listen`` only, begins at the first start command."""
+    def play(self, ledger: LedgerWriter | None = None, progress: Callable[[int], None] = lambda sent: None) -> None:
+        """Play to the end, or for ``duration_ns``. With ``listen`` only, begins at the first start command.
+
+        ``progress`` is given the number of frames sent, about once a second.
+        """
         options, clock = self.options, self.clock
+        told_ns = clock.monotonic_ns()
         end_ns = None if options.duration_ns is None else clock.monotonic_ns() + options.duration_ns
         if options.listen and not options.to and not self._wait_for_start(end_ns):
             return
@@ -167,6 +171,9 @@ class Player:
                 batch.append(due)
                 due = next(dues, None)
             self._send(batch, anchor_ns, line, ledger)
+            if clock.monotonic_ns() - told_ns >= NS:
+                told_ns = clock.monotonic_ns()
+                progress(sum(result.fates[Fate.SENT] for result in self.results))
         if end_ns is None:
             self._drain()
         else:  # the end was asked for in time, not in frames
