@@ -302,6 +302,12 @@ class Served:
     idcode: int
     time_base: int
     frames: Mapping[FrameType, bytes]
+    announced: tuple[FrameType, ...] = (FrameType.CFG2,)
+    """The configurations that go with the data where nobody asks; the last one holds for them."""
+
+    def announcements(self, now_ns: int) -> list[bytes]:
+        """The configurations to send unasked, stamped with UTC ``now_ns``."""
+        return [frame for kind in self.announced if (frame := self.frame(kind, now_ns)) is not None]
 
     def frame(self, kind: FrameType, now_ns: int) -> bytes | None:
         """The answer of this kind, stamped with its time of transmission (clause 6.2.2), UTC ``now_ns``."""
@@ -310,14 +316,18 @@ class Served:
 
 
 def served(config: StreamConfig, header: str = "") -> Served:
-    """What a device that sends ``config``'s data answers: CFG-1, 2 and 3, and a header if there is a text."""
+    """What a device that sends ``config``'s data answers: CFG-1, 2 and 3, and a header if there is a text.
+
+    Unasked it sends CFG-2, and CFG-3 after it where the data need that: CFG-2 cannot say all that CFG-3 says.
+    """
     frames = {
         kind: encode_config(config if config.kind is kind else as_kind(config, kind))
         for kind in (FrameType.CFG1, FrameType.CFG2, FrameType.CFG3)
     }
     if header:
         frames[FrameType.HEADER] = encode_header(config.idcode, header)
-    return Served(config.idcode, config.time_base, frames)
+    announced = (FrameType.CFG2, FrameType.CFG3) if config.kind is FrameType.CFG3 else (FrameType.CFG2,)
+    return Served(config.idcode, config.time_base, frames, announced)
 
 
 class Outcome(StrEnum):

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Sequence
 from types import TracebackType
 
 from pmutools import linux
-from pmutools.c37118.constants import FrameType
 from pmutools.c37118.session import Served
 from pmutools.clock import Clock
 from pmutools.errors import SettingsError
@@ -38,7 +37,6 @@ COARSE_NS = 2_000_000
 _SHARES = 64
 """A period's configurations leave in so many portions, not in one burst."""
 _SENDING_RCVBUF = 4096
-_ANNOUNCED = (FrameType.CFG2, FrameType.CFG3)
 
 
 class Senders:
@@ -47,7 +45,7 @@ class Senders:
     Parameters
     ----------
     cfg_period_ns
-        How often spontaneous streams repeat their configuration (CFG-2); None: only in :meth:`announce`.
+        How often spontaneous streams repeat their configuration; None: only in :meth:`announce`.
     queue_bytes
         Bytes that may wait for one TCP client; frames beyond are dropped for it, and counted.
     native
@@ -191,9 +189,7 @@ class Senders:
             sinks = self._spontaneous[handle]
             if not sinks:
                 continue
-            kind = next((kind for kind in _ANNOUNCED if kind in self._served[handle].frames), None)
-            frame = self._served[handle].frame(kind, utc_ns) if kind is not None else None
-            if frame is not None:
+            for frame in self._served[handle].announcements(utc_ns):
                 for sink in sinks:
                     sink.put(frame, 0, 0)
         self._flush()

@@ -7,7 +7,7 @@ import random
 import select
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -20,6 +20,7 @@ from support.recordings import blocks_of
 
 from pmutools.c37118 import FrameType
 from pmutools.c37118.batch import Batch
+from pmutools.c37118.config import StreamConfig
 from pmutools.clock import SystemClock
 from pmutools.formats import open_sink, open_source
 from pmutools.net.endpoint import parse_endpoint
@@ -180,9 +181,9 @@ def _piece(rng: random.Random) -> int:
 # --- values
 
 
-def batches_of(path: Path) -> list[Batch]:
+def batches_of(path: Path, configs: Iterable[StreamConfig] = ()) -> list[Batch]:
     """A recording of one stream, decoded; it must have no defects."""
-    source = open_source(path)
+    source = open_source(path, configs=configs)
     batches = [block.batch for block in blocks_of(source)]
     assert source.defects() == {}
     return batches

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.captures import REAL_CAPTURES, capture_path
 from support.chain import TRANSPORTS, Chain, assert_same_values, batches_of, column, pass_through
+from support.frames import random_stream
 
 from pmutools.c37118.batch import STAMP_SOURCES
 from pmutools.flow import StampSource
@@ -50,3 +52,14 @@ def stamped(logged: list[object], transport: str) -> None:
     assert sources <= allowed
     arrivals = column(logged, "arrival_ns")  # type: ignore[arg-type]
     assert np.all(np.diff(arrivals) >= 0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_stream_described_by_cfg3_keeps_its_scales(suffix: str, tmp_path: Path) -> None:
+    """CFG-2 has no place for turned phasors and scaled analogs; who listens to UDP gets the CFG-3 too."""
+    described = random_stream(random.Random(8), stations=3, frames=60, data_rate=50, time_base=1_000_000, idcode=9)
+    path = tmp_path / "source.c37118"
+    path.write_bytes(described.config("cfg3") + b"".join(described.data))
+    chain = pass_through(path, "udp", tmp_path / f"log{suffix}")
+    configs = [batch.config for batch in batches_of(path)] if suffix == ".csv" else []
+    assert_same_values(batches_of(path), batches_of(only(chain), configs))

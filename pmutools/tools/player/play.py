@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import Any
 
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.constants import FrameType
 from pmutools.c37118.session import Outcome, Served, served
 from pmutools.clock import Clock, utc_offset
 from pmutools.errors import SettingsError
@@ -197,8 +196,7 @@ class Player:
             marks.append(None)
             if due.out.fate is Fate.SENT:
                 handle = self.handles[due.stream]
-                if (announcement := self._reconfigured(due)) is not None:
-                    frames.append((handle, announcement))
+                frames += [(handle, announcement) for announcement in self._reconfigured(due)]
                 marks[-1] = len(frames)
                 frames.append((handle, due.out.data))
         refusals = Counter(self.senders.publish(frames)) if frames else Counter[int]()
@@ -233,21 +231,21 @@ class Player:
             len(due.out.data),
         )
 
-    def _reconfigured(self, due: Due) -> bytes | None:
-        """Where the recording's configuration changes: offers the new one, and gives the frame that announces it.
+    def _reconfigured(self, due: Due) -> list[bytes]:
+        """Where the recording's configuration changes: offers the new one, and gives the frames that announce it.
 
-        Everyone who gets the data gets that frame before them, whether asked for or not.
+        Everyone who gets the data gets these before them, asked for or not.
         """
         if due.config is self._sent[due.stream]:
-            return None
+            return []
         self._sent[due.stream] = due.config
         config = self._idle.config(due.config)
         if config == self._announced[due.stream]:
-            return None
+            return []
         self._announced[due.stream] = config
         offer = _offer(config)
         self.senders.replace(self.handles[due.stream], offer)
-        return offer.frame(FrameType.CFG2, self.clock.realtime_ns())
+        return offer.announcements(self.clock.realtime_ns())
 
     def _wait_for_start(self, end_ns: int | None) -> bool:
         while not self._stop() and (end_ns is None or self.clock.monotonic_ns() < end_ns):
