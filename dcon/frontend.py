@@ -109,7 +109,8 @@ def bind(
     chosen = config.stations[index]
     if chosen.fnom_hz != nominal_hz:
         raise SettingsError(
-            f"PMU {name}: station {chosen.name} measures a {chosen.fnom_hz:g} Hz grid, not {nominal_hz:g} Hz"
+            f"PMU {name}: station {chosen.name} measures a {chosen.fnom_hz:g} Hz grid, not {nominal_hz:g} Hz; "
+            f"set nominal_hz = {chosen.fnom_hz:g} in [controller], or take another PMU"
         )
     first = layout_of(config).slots[index].phasor_columns.start
     channels = [channel.name for channel in chosen.phasors]

@@ -8,16 +8,17 @@ from typing import Any
 
 import click
 
-from pmutools.cli.shell import Exit, Talk, common
+from pmutools.cli.shell import Exit, Parsed, Talk, common
 from pmutools.errors import SettingsError
+from pmutools.parsers import number
 
 SHORTEST_S = 48.0
 
 
 @click.command(name="demo", short_help="The whole chain live on this machine: open loop, then closed loop.")
-@click.option("--duration", type=click.FloatRange(SHORTEST_S, 600), metavar="S", help="Longer swings; 56 s by default.")
+@click.option("--duration", type=Parsed(number(SHORTEST_S, 600)), metavar="S", help="Longer swings; 56 s by default.")
 @click.option("--out", default="demo", show_default=True, type=click.Path(path_type=Path, file_okay=False))
-@click.option("--gain", type=click.FloatRange(0, 15), default=12.0, show_default=True, metavar="K", help="MW/mHz.")
+@click.option("--gain", type=Parsed(number(0, 15)), default=12.0, show_default=True, metavar="K", help="MW/mHz.")
 @click.option("--impair", default="table1", show_default=True, metavar="PROFILE", help="What happens on the network.")
 @click.option("--seed", type=int, default=1, show_default=True)
 @common

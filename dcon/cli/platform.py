@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmutools.cli.shell import Exit, Talk, common
-from pmutools.errors import SettingsError
+from pmutools.cli.shell import Exit, Parsed, Talk, common
+from pmutools.errors import SettingsError, SourceError
+from pmutools.parsers import number
 
 if TYPE_CHECKING:
     from dcon.platform.loop import Platform
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 @click.command(name="platform", short_help="The real-time controller: PMU streams in, command out, session log.")
 @click.option("--ini", required=True, metavar="FILE")
 @click.option("--log", metavar="FILE", help="Session log; default: [log] path.")
-@click.option("--duration", type=click.FloatRange(0, min_open=True), metavar="S", help="Stop S seconds after --start.")
+@click.option("--duration", type=Parsed(number(1e-3, 1e9)), metavar="S", help="Stop S seconds after --start.")
 @click.option("--start", metavar="UTC", help="What --duration and --order count from; default: now.")
 @click.option("--order", "orders", multiple=True, metavar="S:NAME[=VALUE]", help="An order for later; repeatable.")
 @common
@@ -61,7 +62,12 @@ def command(
     if as_json:
         click.echo(json.dumps(asdict(summary)))
     talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}; session log {path}")
-    return Exit.INTERRUPTED if platform.stopping else Exit.DONE
+    if platform.stopping:
+        return Exit.INTERRUPTED
+    if not summary.frames:
+        where = ", ".join(str(site.url) for site in settings.sites)
+        raise SourceError(f"no frame came from any PMU ({where}); are they on, and the ports and IDCODEs right?")
+    return Exit.DONE
 
 
 @contextmanager

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmutools.cli.shell import Talk, common
+from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SettingsError, SourceError
+from pmutools.parsers import number
 
 if TYPE_CHECKING:
     from dcon.sim.plan import Plan
@@ -25,18 +26,16 @@ SWEEP_LIMIT = 10_000
 @click.command(name="simulate", short_help="A scenario in virtual time, through the same bytes and the same engine.")
 @click.argument("scenario_name", metavar="SCENARIO")
 @click.option("--plant", default="modal", show_default=True, metavar="NAME")
-@click.option("--gain", type=click.FloatRange(0, 100), default=9.0, show_default=True, metavar="K", help="MW/mHz.")
-@click.option("--delay", type=click.FloatRange(0, 2000), default=82.0, show_default=True, metavar="MS", help="Total.")
-@click.option("--deadband", type=click.FloatRange(0, 100), default=0.0, show_default=True, metavar="MHZ")
-@click.option("--noise", type=click.FloatRange(0, 100), default=0.0, metavar="MRAD", help="Angle noise of every PMU.")
+@click.option("--gain", type=Parsed(number(0, 100)), default=9.0, show_default=True, metavar="K", help="MW/mHz.")
+@click.option("--delay", type=Parsed(number(0, 2000)), default=82.0, show_default=True, metavar="MS", help="Total.")
+@click.option("--deadband", type=Parsed(number(0, 100)), default=0.0, show_default=True, metavar="MHZ")
+@click.option("--noise", type=Parsed(number(0, 100)), default=0.0, metavar="MRAD", help="Angle noise of every PMU.")
 @click.option("--fault", "faults", multiple=True, metavar="NAME", help="A fault of the paper; repeatable.")
 @click.option("--impair", metavar="PROFILE", help="An impairment profile: a ready one's name, or a file.")
 @click.option("--no-control", is_flag=True, help="Compute and log, but drive nothing.")
 @click.option("--no-align", is_flag=True, help="Do not align on time stamps (to see why one must).")
 @click.option("--interpolate", is_flag=True, help="Bridge single lost frames by their midpoint.")
-@click.option(
-    "--duration", type=click.FloatRange(0, 86400, min_open=True), metavar="S", help="Default: until all is seen."
-)
+@click.option("--duration", type=Parsed(number(1e-3, 86400)), metavar="S", help="Default: until all is seen.")
 @click.option("--seed", type=int, default=1, show_default=True, metavar="N")
 @click.option("--sweep", "sweeps", multiple=True, metavar="NAME=FROM:TO:STEP", help="gain, delay, deadband or seed.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Log the session there.")
@@ -92,9 +91,9 @@ def command(
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SourceError(f"--out {out}: {error.strerror}") from None
-    for number, each in enumerate(plans, 1):
-        path = None if out is None else str(out / ("session.mcap" if len(plans) == 1 else f"session-{number}.mcap"))
-        outcome = simulate(each, path, partial(_progress, talk, f"run {number} of {len(plans)}"))
+    for run, each in enumerate(plans, 1):
+        path = None if out is None else str(out / ("session.mcap" if len(plans) == 1 else f"session-{run}.mcap"))
+        outcome = simulate(each, path, partial(_progress, talk, f"run {run} of {len(plans)}"))
         talk.progress("")
         if as_json:
             click.echo(json.dumps(outcome.to_json() | ({"session": path} if path else {})))

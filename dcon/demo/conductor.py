@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,18 +76,47 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
     ini = demo.out / "dcon.ini"
     try:
         demo.out.mkdir(parents=True, exist_ok=True)
-        ini.write_text(
-            ini_of(
-                pmus,
-                gain_mw_per_mhz=demo.gain_mw_per_mhz,
-                deadband_mhz=0.0,
-                init_s=course.init_s,
-                urls=[f"udp://127.0.0.1:{pmu_port + number}" for number in range(len(pmus))],
-                extra=f"\n[output]\nurl = udp://127.0.0.1:{command_port}\n",
+        with _alone(demo.out):
+            ini.write_text(
+                ini_of(
+                    pmus,
+                    gain_mw_per_mhz=demo.gain_mw_per_mhz,
+                    deadband_mhz=0.0,
+                    init_s=course.init_s,
+                    urls=[f"udp://127.0.0.1:{pmu_port + number}" for number in range(len(pmus))],
+                    extra=f"\n[output]\nurl = udp://127.0.0.1:{command_port}\n",
+                )
             )
-        )
+            return _perform(demo, ini, command_port, pmu_port, tell)
+    except PmuError:
+        raise
     except OSError as error:
         raise SourceError(f"--out {demo.out}: {error.strerror}") from None
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a folder's demo to this process; raises SourceError where another is running in it."""
+    try:
+        import fcntl
+    except ImportError:  # no advisory locks on this system
+        yield
+        return
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SourceError(f"another demo is writing into {folder}; give this one a folder with --out") from None
+        yield
+    finally:
+        os.close(held)
+
+
+def _perform(
+    demo: Demo, ini: Path, command_port: int, pmu_port: int, tell: Callable[[str, float], None]
+) -> dict[str, Any]:
+    course = demo.course
     start_ns = (time.time_ns() // timebase.NS + 1) * timebase.NS + round(LEAD_S * timebase.NS)
     processes: dict[str, subprocess.Popen[str]] = {}
     try:

@@ -62,5 +62,8 @@ def command(
     if stopped:
         return Exit.INTERRUPTED
     if not reading.frames and not reading.skipped:
-        raise SourceError(f"no data came from {', '.join(urls)}; is the sender on, and the port and IDCODE right?")
+        raise SourceError(
+            f"no data came from {', '.join(urls)}; is the sender on, and the port right? "
+            "A device answers to its own IDCODE only: name it with ?idcode=N"
+        )
     return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE

@@ -295,7 +295,10 @@ def test_ctrl_c_ends_both_children(number: signal.Signals, tmp_path: Path) -> No
                 os.killpg(demo.pid, signal.SIGKILL)
     assert demo.returncode == 130
     assert "Traceback" not in err
-    assert [pid for pid in ended if Path(f"/proc/{pid}").exists()] == []
+    deadline = time.monotonic() + 5
+    while (left := [pid for pid in ended if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert left == []
 
 
 # --- all of it ---------------------------------------------------------------------------------------------------

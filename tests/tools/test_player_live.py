@@ -208,5 +208,5 @@ def test_the_last_frames_reach_a_client_that_is_behind() -> None:
     with serving(recording(stream(), 500), speed=Fraction(1000)) as (_, port), Client(port) as client:
         client.say(START)
         time.sleep(0.5)
-        client.hear(2)
+        client.hear_until(500)
     assert client.numbers == [*range(500)]
