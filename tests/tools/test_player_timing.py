@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import dataclass
 from fractions import Fraction
 
 import pytest
-from support.playing import MS, START_NS, Played, Stage, at, interleaved, play, recording, started, stream
+from support.playing import MS, START_NS, Played, Stage, at, faults, interleaved, play, recording, started, stream
 
 from pmutools.c37118 import FrameType, decode_config, decode_prefix
 from pmutools.c37118.session import Served
 from pmutools.clock import VirtualClock
 from pmutools.errors import SettingsError, SourceError
+from pmutools.impair.pipeline import Pipeline
 from pmutools.net.endpoint import parse_endpoint
+from pmutools.net.outlet import ServerEvent
 from pmutools.timebase import NS, slot, slot_time_ns
+from pmutools.tools.player.plan import plan
 from pmutools.tools.player.script import cues, study
+from pmutools.tools.player.stamps import StampPolicy, timeline
 from pmutools.tools.window import Window, parse_moment
 
 LISTEN = parse_endpoint("tcp://127.0.0.1:4712")
@@ -96,6 +102,12 @@ def test_speed_scales_send_times_not_stamps() -> None:
     assert spaced(played.stamps(), 20 * MS)
 
 
+def test_wall_time_is_exact_however_long_it_plays() -> None:
+    script = study(recording(stream(), 2))
+    line = timeline(script, StampPolicy.SHIFT, NOW_NS, speed=Fraction(1, 3))
+    assert line.offset_ns(10**17 + 1) == 3 * 10**17 + 3
+
+
 def test_interval_sets_the_spacing_of_each_stream_and_leaves_the_stamps() -> None:
     slow, fast = recording(stream(1, rate=25), 40), recording(stream(2, rate=50), 80, first_slot=50)
     played = play(interleaved(slow, fast), interval_ns=7_300_000)
@@ -122,6 +134,13 @@ def test_fps_makes_new_stamps_on_the_new_grid_and_another_data_rate(fps: int, po
         assert abs(left - stamp) <= 500, "sent when due, to the resolution of TIME_BASE"
     for kind in (FrameType.CFG1, FrameType.CFG2, FrameType.CFG3):
         assert decode_config(played.stage.offered[0].frames[kind])[1].data_rate == fps
+
+
+@pytest.mark.parametrize("first_slot", [0, 1, 2, 59])
+def test_fps_at_the_recorded_rate_moves_no_stamp(first_slot: int) -> None:
+    """Recorded stamps are rounded to TIME_BASE, so some lie just after their reporting instant."""
+    source = recording(stream(rate=60), 120, first_slot=first_slot)
+    assert play(source, clock=clock(), fps=60).stamps() == play(source, clock=clock()).stamps()
 
 
 def test_fps_brings_streams_of_different_rates_together() -> None:
@@ -201,6 +220,13 @@ def test_frames_that_came_late_leave_late_and_out_of_order_as_recorded() -> None
     source = recording(stream(), 50, latency_ns=lambda k: 70 * MS if k == 10 else MS)
     played = play(sorted(source, key=lambda message: message.frame.arrival_ns or 0), clock=clock())
     assert played.numbers() == [*range(10), 11, 12, 13, 10, *range(14, 50)]
+
+
+def test_frames_recorded_out_of_order_are_played_by_their_stamps_if_so_asked() -> None:
+    source = recording(stream(), 50, latency_ns=lambda k: 70 * MS if k == 10 else MS)
+    played = play(sorted(source, key=lambda message: message.frame.arrival_ns or 0), timing="stamp")
+    assert played.numbers() == [*range(50)]
+    assert spaced(played.times(), 20 * MS)
 
 
 # --- loops
@@ -316,6 +342,41 @@ def test_a_player_told_to_stop_stops_between_frames() -> None:
     assert 3 * NS <= played.stage.now_ns <= 3 * NS + 120 * MS
     assert 90 <= len(played.data) <= 160
     assert stage.closed
+
+
+@dataclass
+class Queueing(Stage):
+    """Its clients take ``takes`` bytes with each poll."""
+
+    takes: int = 0
+
+    def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
+        self.queued_bytes = max(0, self.queued_bytes - self.takes)
+        return super().poll(timeout_ns)
+
+
+@pytest.mark.parametrize(("takes", "waits_ns"), [(1000, 0), (100, 900 * MS), (0, 2 * NS)])
+def test_at_the_end_clients_have_two_seconds_for_what_waits_for_them(takes: int, waits_ns: int) -> None:
+    timing = clock()
+    stage = Queueing(timing, queued_bytes=1000, takes=takes)
+    played = play(recording(stream(), 5), clock=timing, stage=stage)
+    assert stage.now_ns - played.times()[-1] == pytest.approx(waits_ns, abs=110 * MS)
+
+
+def test_what_waits_to_be_sent_is_a_window_of_the_source() -> None:
+    """Not all of it, whatever was read ahead or might have been held back."""
+    source = recording(stream(), 20_000)
+    script = study(source)
+    line = timeline(script, StampPolicy.SHIFT, NOW_NS)
+    pipelines = [Pipeline(faults("delay=normal(30,5)"), "PMU 7", 1)]
+    tracemalloc.start()
+    try:
+        count = sum(1 for _ in plan(script, lambda: source, line, pipelines))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert count == 20_000
+    assert peak < 1_500_000
 
 
 def test_a_waiting_player_told_to_stop_does_so() -> None:
