@@ -60,3 +60,36 @@ class Train(NamedTuple):
         """The datagrams one by one."""
         for at, arrival_ns in zip(range(0, len(self.data), self.size), self.arrivals_ns, strict=True):
             yield Chunk(self.data[at : at + self.size], arrival_ns, self.flow, self.stamp_source)
+
+
+class Hangup(StrEnum):
+    """What TCP clients see of a stream that falls silent."""
+
+    SILENCE = "silence"
+    """An open connection without data."""
+    FIN = "fin"
+    RST = "rst"
+    REFUSE = "refuse"
+    """RST, and no new connection until the stream comes back."""
+
+
+class Cut(StrEnum):
+    """How the bytes of a frame are handed to a TCP connection, where not whole and at once."""
+
+    SPLIT = "split"
+    COALESCE = "coalesce"
+    STALL = "stall"
+    RESET = "reset"
+
+
+class Segmentation(NamedTuple):
+    """How a frame is written to a byte stream; datagrams are always whole.
+
+    ``split``: in ``count`` pieces, ``gap_ns`` apart. ``coalesce``: kept until ``count`` frames are there, then in one
+    write. ``stall``: the connection writes nothing for ``gap_ns``, then this frame and what came after. ``reset``:
+    the first ``count`` bytes (0: half of them), then RST.
+    """
+
+    cut: Cut
+    count: int = 0  # type: ignore[assignment]  # not tuple.count
+    gap_ns: int = 0
