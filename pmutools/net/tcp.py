@@ -7,15 +7,18 @@ marks as batched.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
 import struct
 import sys
 import time
+from collections import deque
+from typing import NamedTuple
 
 from pmutools import linux
-from pmutools.flow import Chunk, Flow, StampSource
+from pmutools.flow import Chunk, Cut, Flow, Segmentation, StampSource
 from pmutools.net.sockets import Address, explain, resolve, stamp_arrivals
 
 READ_BYTES = 256 << 10
@@ -23,6 +26,8 @@ QUEUE_BYTES = 256 << 10
 """Bytes that may wait for one slow client, beside the kernel's send buffer of the same size."""
 STALL_NS = 10_000_000_000
 """A client that takes nothing for so long while bytes wait for it is disconnected."""
+KEPT_NS = 10_000_000_000
+"""Frames that wait for others to share their write wait no longer."""
 _BACKLOG = 1024
 _VANISHED_MS = 30_000
 _LAST_READS = 16
@@ -149,10 +154,40 @@ class TcpListener:
             return None
 
 
+class CutOff(ConnectionResetError):
+    """A :class:`Segmentation` says that the connection ends here, by RST."""
+
+
+class _Piece(NamedTuple):
+    """Bytes for one send call, ``wait_ns`` after the piece before; ``last``: then the connection is cut off."""
+
+    data: bytes
+    wait_ns: int = 0
+    last: bool = False
+
+
+def _pieces(frame: bytes, write: Segmentation | None) -> list[_Piece]:
+    """How a frame is written; coalescing concerns several frames, and is none of this function's business."""
+    if write is not None and write.cut is Cut.SPLIT:
+        count = max(1, min(write.count, len(frame)))
+        bounds = [len(frame) * k // count for k in range(count + 1)]
+        return [_Piece(frame[bounds[k] : bounds[k + 1]], write.gap_ns if k else 0) for k in range(count)]
+    if write is not None and write.cut is Cut.STALL:
+        return [_Piece(frame, write.gap_ns)]
+    if write is not None and write.cut is Cut.RESET:
+        return [_Piece(frame[: write.count or len(frame) // 2]), _Piece(b"", last=True)]
+    return [_Piece(frame)]
+
+
 class TcpPeer:
     """A client of ours. What it does not take at once waits in a queue of at most ``queue_bytes``.
 
     Frames that do not fit are dropped, whole, and counted: a slow client sees a gap, never half a frame.
+
+    Bytes leave in the order in which frames were put: first the queue (what the client would not take), then the plan
+    (pieces that wait for their time), then the frames kept to share a write. All three count as queued. The owner calls
+    :meth:`flush` when the client takes bytes again, :meth:`release` at :attr:`due_ns`, and :meth:`tidy` now and then;
+    these and :meth:`put` raise OSError when the connection is broken, :class:`CutOff` when it is to be reset.
     """
 
     def __init__(self, sock: socket.socket, address: Address, local: Address, queue_bytes: int = QUEUE_BYTES) -> None:
@@ -162,6 +197,13 @@ class TcpPeer:
         self.dropped = 0
         self._sock = sock
         self._queue = bytearray()
+        self._plan: deque[_Piece] = deque()
+        self._plan_bytes = 0
+        self._plan_due_ns = 0
+        self._kept: list[bytes] = []
+        self._kept_bytes = 0
+        self._kept_since_ns = 0
+        self._ending = False
         self._stuck_since_ns: int | None = None
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -176,32 +218,58 @@ class TcpPeer:
         """End the connection with FIN, or with RST and whatever waits thrown away."""
         if reset:
             self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("@ii", 1, 0))
+        else:
+            with contextlib.suppress(OSError):  # the client may be gone
+                if self._kept and not self._queue and not self._plan:
+                    self._send(b"".join(self._kept))
+                for _ in range(_LAST_READS):  # closing over unread commands would reset
+                    if not self._sock.recv(READ_BYTES):
+                        break
         self._sock.close()
 
     @property
     def queued_bytes(self) -> int:
-        return len(self._queue)
+        """Bytes not yet handed to the system: the client's slowness, and what is held back on purpose."""
+        return len(self._queue) + self._plan_bytes + self._kept_bytes
 
-    def put(self, frame: bytes, now_ns: int) -> bool:
-        """Send, or queue, one frame whole; false if it was dropped. ``now_ns`` is monotonic.
+    @property
+    def blocked(self) -> bool:
+        """Whether bytes wait for the client to take some."""
+        return bool(self._queue)
 
-        Raises OSError when the connection is broken.
+    @property
+    def due_ns(self) -> int | None:
+        """When :meth:`release` has something to do; None while nothing is planned, or the client blocks it."""
+        return self._plan_due_ns if self._plan and not self._queue else None
+
+    def put(self, frame: bytes, now_ns: int, write: Segmentation | None = None) -> bool:
+        """Send, or queue, one frame whole, in the way ``write`` says; false if it was dropped.
+
+        ``now_ns`` is monotonic.
         """
-        if not self._queue:
-            sent = self._send(frame)
-            if sent == len(frame):
-                return True
-            self._stuck_since_ns = now_ns
-            self._queue += frame[sent:]
+        if write is None and not (self._queue or self._plan or self._kept):
+            self._write(frame, now_ns)  # the usual case
             return True
-        if len(self._queue) + len(frame) > self.queue_bytes:
-            self.dropped += 1
+        if self._ending:
             return False
-        self._queue += frame
+        if write is not None and write.cut is Cut.COALESCE:
+            return self._keep(frame, write.count, now_ns)
+        self._release_kept(now_ns)
+        pieces = _pieces(frame, write)
+        self._ending = pieces[-1].last
+        if not self._fits(frame):
+            self.dropped += 1
+            if self._ending:  # a full queue does not save the connection
+                self._schedule(pieces[1:], now_ns)
+            return False
+        if write is None and self._queue and not self._plan:
+            self._queue += frame
+        else:
+            self._schedule(pieces, now_ns)
         return True
 
     def flush(self, now_ns: int) -> None:
-        """Send from the queue what the client takes; raises OSError when the connection is broken."""
+        """Send from the queue what the client takes, and what is due behind it."""
         while self._queue:
             with memoryview(self._queue) as view:
                 sent = self._send(view[:READ_BYTES])
@@ -210,20 +278,77 @@ class TcpPeer:
             del self._queue[:sent]
             self._stuck_since_ns = now_ns
         self._stuck_since_ns = None
+        self.release(now_ns)
+
+    def release(self, now_ns: int) -> None:
+        """Send the pieces that are due, each by a call of its own."""
+        while self._plan and not self._queue and now_ns >= self._plan_due_ns:
+            piece = self._plan[0]
+            if piece.last:  # and stays: nothing goes past it
+                raise CutOff(errno.ECONNRESET, "cut off amid a frame, as asked")
+            self._plan.popleft()
+            self._plan_bytes -= len(piece.data)
+            self._write(piece.data, now_ns)
+            if self._plan:  # from now: a late piece does not catch up with the one before
+                self._plan_due_ns = now_ns + self._plan[0].wait_ns
+
+    def tidy(self, now_ns: int) -> None:
+        """Send the kept frames that have waited :data:`KEPT_NS` for others."""
+        if self._kept and now_ns - self._kept_since_ns > KEPT_NS:
+            self._release_kept(now_ns)
 
     def stalled(self, now_ns: int) -> bool:
         """Whether bytes have waited :data:`STALL_NS` without the client taking any."""
         return self._stuck_since_ns is not None and now_ns - self._stuck_since_ns > STALL_NS
 
-    def read(self) -> bytes:
+    def read(self, nbytes: int = 1 << 16) -> bytes:
         """What the client sent, empty if nothing; raises OSError when the connection is closed (EPIPE) or broken."""
         try:
-            data = self._sock.recv(1 << 16)
+            data = self._sock.recv(nbytes)
         except (BlockingIOError, InterruptedError):
             return b""
         if not data:
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
         return data
+
+    def _fits(self, frame: bytes) -> bool:
+        """Whether the queue has room; where nothing waits it has, for a frame of any size."""
+        return not self.queued_bytes or self.queued_bytes + len(frame) <= self.queue_bytes
+
+    def _keep(self, frame: bytes, count: int, now_ns: int) -> bool:
+        if self._kept_bytes + len(frame) > self.queue_bytes:
+            self._release_kept(now_ns)
+        if not self._fits(frame):
+            self.dropped += 1
+            return False
+        if not self._kept:
+            self._kept_since_ns = now_ns
+        self._kept.append(frame)
+        self._kept_bytes += len(frame)
+        if len(self._kept) >= count:
+            self._release_kept(now_ns)
+        return True
+
+    def _release_kept(self, now_ns: int) -> None:
+        if self._kept:
+            joined = b"".join(self._kept)
+            self._kept.clear()
+            self._kept_bytes = 0
+            self._schedule([_Piece(joined)], now_ns)
+
+    def _schedule(self, pieces: list[_Piece], now_ns: int) -> None:
+        if not self._plan:
+            self._plan_due_ns = now_ns + pieces[0].wait_ns
+        self._plan += pieces
+        self._plan_bytes += sum(len(piece.data) for piece in pieces)
+        self.release(now_ns)
+
+    def _write(self, data: bytes, now_ns: int) -> None:
+        """Send now, while the queue is empty; what is not taken becomes the queue."""
+        sent = self._send(data)
+        if sent < len(data):
+            self._stuck_since_ns = now_ns
+            self._queue += data[sent:]
 
     def _send(self, data: bytes | memoryview) -> int:
         try:

@@ -14,10 +14,10 @@ from support.live import data_frame, stream
 from pmutools import linux
 from pmutools.c37118.framer import Frame, Framer, Skipped
 from pmutools.errors import SourceError
-from pmutools.flow import Chunk, StampSource
+from pmutools.flow import Chunk, Cut, Segmentation, StampSource
 from pmutools.net import tcp
 from pmutools.net.sockets import Address
-from pmutools.net.tcp import TcpClient, TcpListener, TcpPeer
+from pmutools.net.tcp import CutOff, TcpClient, TcpListener, TcpPeer
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -238,3 +238,219 @@ def test_a_local_address_that_is_none_is_told() -> None:
     with pytest.raises(SourceError, match="does not have that address"):
         TcpClient(listener.address, local=Address(socket.AF_INET, ("192.0.2.123", 0)))
     listener.close()
+
+
+# --- how a frame is written
+
+
+MS = 1_000_000
+
+
+def received(client: TcpClient, count: int) -> bytes:
+    """What has come by the time ``count`` bytes have; more, if there is more."""
+    got = bytearray()
+
+    def enough() -> bool:
+        if (chunk := client.read()) is not None:
+            got.extend(chunk.data)
+        return len(got) >= count
+
+    wait(enough)
+    got.extend(b"" if (chunk := client.read()) is None else chunk.data)
+    return bytes(got)
+
+
+class Witness(socket.socket):
+    """A connected socket that notes each send call."""
+
+    def __init__(self, inner: socket.socket) -> None:
+        super().__init__(inner.family, inner.type, inner.proto, inner.detach())
+        self.calls: list[bytes] = []
+
+    def send(self, data: ReadableBuffer, flags: int = 0, /) -> int:
+        self.calls.append(bytes(data))
+        return super().send(data, flags)
+
+
+def witnessed(*, queue_bytes: int = tcp.QUEUE_BYTES) -> tuple[TcpListener, TcpClient, TcpPeer, list[bytes]]:
+    listener, client, peer = connected(queue_bytes=queue_bytes)
+    peer._sock = witness = Witness(peer._sock)
+    return listener, client, peer, witness.calls
+
+
+def test_a_split_frame_goes_piece_by_piece_and_later_frames_wait_behind_it() -> None:
+    listener, client, peer, calls = witnessed()
+    first, second, third = FRAMES[:3]
+    assert peer.put(first, 0, Segmentation(Cut.SPLIT, 3, 5 * MS))
+    assert peer.put(second, MS)
+    assert peer.put(third, MS, Segmentation(Cut.SPLIT, 2, 7 * MS))
+    assert len(calls) == 1
+    assert peer.queued_bytes == 3 * len(first) - len(calls[0])
+    assert not peer.blocked
+    times = []
+    while (due_ns := peer.due_ns) is not None:
+        peer.release(due_ns - 1)  # a timer that rings early does no harm
+        assert peer.due_ns == due_ns
+        peer.release(due_ns)
+        times.append(due_ns)
+    assert times == [5 * MS, 10 * MS, 17 * MS]
+    assert [len(call) for call in calls[:3]] == [8, 9, 9]
+    assert calls[3] == second
+    assert b"".join(calls) == first + second + third == received(client, 3 * len(first))
+    assert len(calls) == 6
+    assert not peer.queued_bytes
+    assert not peer.stalled(1 << 62)  # time that we let pass is not the client's
+    close(listener, client, peer)
+
+
+def test_pieces_are_no_smaller_than_a_byte() -> None:
+    listener, client, peer, calls = witnessed()
+    assert peer.put(b"abc", 0, Segmentation(Cut.SPLIT, 1000))
+    assert peer.put(b"de", 0, Segmentation(Cut.SPLIT, 0))
+    assert calls == [b"a", b"b", b"c", b"de"]
+    close(listener, client, peer)
+
+
+def test_coalesced_frames_share_one_write() -> None:
+    listener, client, peer, calls = witnessed()
+    three = Segmentation(Cut.COALESCE, 3)
+    for frame in FRAMES[:2]:
+        assert peer.put(frame, 0, three)
+    assert not calls
+    assert peer.queued_bytes == 2 * len(FRAMES[0])
+    peer.put(FRAMES[2], 0, three)
+    assert calls == [b"".join(FRAMES[:3])]
+    peer.put(FRAMES[3], 0, three)
+    peer.put(FRAMES[4], 0)  # one that may not wait takes those kept along, before it
+    assert calls[1:] == FRAMES[3:5]
+    peer.put(FRAMES[5], 0, three)
+    peer.tidy(tcp.KEPT_NS)
+    assert len(calls) == 3
+    peer.tidy(tcp.KEPT_NS + 1)
+    assert calls[3:] == FRAMES[5:6]
+    peer.put(FRAMES[6], 0, three)
+    assert received(client, 6 * len(FRAMES[0])) == b"".join(FRAMES[:6])
+    peer.close()
+    chunks: list[Chunk | None] = []
+    wait(lambda: chunks.append(client.read()) or chunks[-1])
+    assert chunks[-1] is not None
+    assert chunks[-1].data == FRAMES[6]
+    with pytest.raises(BrokenPipeError):  # FIN, not RST
+        wait(client.read)
+    close(listener, client)
+
+
+def test_frames_kept_are_bounded_by_the_queue() -> None:
+    listener, client, peer, calls = witnessed(queue_bytes=4096)
+    sent = 0
+    while not calls:
+        assert peer.put(FRAMES[sent], 0, Segmentation(Cut.COALESCE, 10**9))
+        sent += 1
+        assert peer.queued_bytes <= 4096
+    assert calls == [b"".join(FRAMES[: sent - 1])]
+    assert not peer.dropped
+    close(listener, client, peer)
+
+
+def test_a_stall_holds_back_all_that_follows() -> None:
+    listener, client, peer, calls = witnessed()
+    peer.put(FRAMES[0], 0)
+    peer.put(FRAMES[1], 10 * MS, Segmentation(Cut.STALL, gap_ns=50 * MS))
+    peer.put(FRAMES[2], 20 * MS)
+    peer.put(FRAMES[3], 30 * MS, Segmentation(Cut.COALESCE, 2))
+    assert peer.due_ns == 60 * MS
+    peer.release(60 * MS)
+    assert calls == FRAMES[:3]
+    peer.put(FRAMES[4], 70 * MS, Segmentation(Cut.COALESCE, 2))
+    assert calls[3:] == [FRAMES[3] + FRAMES[4]]
+    close(listener, client, peer)
+
+
+@pytest.mark.parametrize(("count", "taken"), [(5, 5), (0, len(FRAMES[1]) // 2), (10**6, len(FRAMES[1]))])
+def test_a_reset_comes_amid_the_frame(count: int, taken: int) -> None:
+    listener, client, peer = connected()
+    peer.put(FRAMES[0], 0)
+    with pytest.raises(CutOff):
+        peer.put(FRAMES[1], 0, Segmentation(Cut.RESET, count))
+    assert not peer.put(FRAMES[2], 0)
+    peer.close(reset=True)
+    got = bytearray()
+
+    def ended() -> bool:
+        if (chunk := client.read()) is not None:
+            got.extend(chunk.data)
+        return False
+
+    with pytest.raises(ConnectionResetError):
+        wait(ended)
+    assert got == FRAMES[0] + FRAMES[1][:taken]
+    close(listener, client)
+
+
+def test_what_is_planned_obeys_the_bound_of_the_queue() -> None:
+    listener, client, peer, _calls = witnessed(queue_bytes=4096)
+    peer.put(FRAMES[0], 0, Segmentation(Cut.STALL, gap_ns=MS))
+    taken = [frame for frame in FRAMES[1:] if peer.put(frame, 0, Segmentation(Cut.SPLIT, 2))]
+    assert peer.dropped == len(FRAMES) - 1 - len(taken) > 0
+    assert 4096 - len(FRAMES[0]) < peer.queued_bytes <= 4096
+    assert not peer.put(FRAMES[-1], 0, Segmentation(Cut.RESET))  # its bytes find no room; the reset holds
+    got = bytearray()
+
+    def cut_off() -> None:
+        peer.flush(MS)
+        if (chunk := client.read()) is not None:
+            got.extend(chunk.data)
+
+    with pytest.raises(CutOff):
+        wait(cut_off)
+    expected = FRAMES[0] + b"".join(taken)
+    got += received(client, len(expected) - len(got))
+    assert got == expected
+    close(listener, client, peer)
+
+
+def test_a_slow_client_gets_its_pieces_in_order_and_its_slowness_counts() -> None:
+    sock = Scripted(10, 0, 1000, 1000, 1000, 1000)
+    peer = TcpPeer(sock, Address(socket.AF_INET, ("192.0.2.1", 1)), Address(socket.AF_INET, ("192.0.2.2", 2)))
+    peer.put(b"x" * 30, 0, Segmentation(Cut.SPLIT, 2, MS))
+    assert peer.due_ns is None  # five bytes wait for the client, the other piece for them
+    assert peer.blocked
+    peer.release(2 * MS)
+    peer.flush(3 * MS)
+    assert sock.takes == [1000] * 4
+    assert peer.stalled(tcp.STALL_NS + 1)
+    peer.put(b"y", 3 * MS)
+    peer.flush(4 * MS)
+    assert sock.takes == [1000]  # the rest, the second piece, what came after
+    assert not peer.queued_bytes
+    peer.close()
+
+
+def test_any_mixture_of_writes_keeps_the_bytes_in_order() -> None:
+    rng = random.Random(11)
+    listener, client, peer = connected(queue_bytes=1 << 20)
+    now_ns, framer, got, sent = 0, Framer(streaming=True), list[bytes](), list[bytes]()
+    cuts = (Cut.SPLIT, Cut.COALESCE, Cut.STALL)
+    for k in range(2000):
+        now_ns += rng.randrange(2 * MS)
+        write = rng.choice([None, None, Segmentation(rng.choice(cuts), rng.randrange(9), rng.randrange(3 * MS))])
+        frame = data_frame(CONFIG, k * 10**9, value=k)
+        assert peer.put(frame, now_ns, write)
+        sent.append(frame)
+        if (due_ns := peer.due_ns) is not None and due_ns <= now_ns:
+            peer.release(now_ns)
+    peer.tidy(now_ns + tcp.KEPT_NS + 1)
+
+    def drained() -> bool:
+        nonlocal now_ns
+        now_ns += 3 * MS
+        peer.flush(now_ns)
+        while (chunk := client.read()) is not None:
+            for item in framer.feed(chunk.data):
+                assert isinstance(item, Frame)
+                got.append(item.data)
+        return len(got) == len(sent)
+
+    wait(drained, seconds=5)
+    assert got == sent
+    close(listener, client, peer)
