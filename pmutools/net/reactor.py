@@ -43,6 +43,8 @@ class Reactor:
         self._timers: list[tuple[int, int, Timer]] = []
         self._order = count()
         self._forgotten: set[int] = set()
+        self._again: dict[int, int] = {}
+        """Sockets to be called in the next turn whether ready or not, by descriptor: their events."""
 
     def watch(self, source: HasFileno, events: int, handler: Callable[[int], None]) -> None:
         """Call ``handler(events)`` when ``source`` is ready; replaces what was watched before."""
@@ -54,9 +56,16 @@ class Reactor:
     def forget(self, source: HasFileno) -> None:
         """Stop watching, before ``source`` is closed; nothing happens if it was not watched."""
         try:
-            self._forgotten.add(self._selector.unregister(source).fd)
+            fd = self._selector.unregister(source).fd
         except (KeyError, ValueError):
             return
+        self._forgotten.add(fd)
+        self._again.pop(fd, None)
+
+    def again(self, source: HasFileno, events: int) -> None:
+        """Call the handler of ``source`` in the next turn too: it has left off in favour of others."""
+        fd = source.fileno()
+        self._again[fd] = self._again.get(fd, 0) | events
 
     def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> Timer:
         """Call back once the monotonic clock reads ``deadline_ns``."""
@@ -67,21 +76,39 @@ class Reactor:
     def call_in(self, delay_ns: int, callback: Callable[[], None]) -> Timer:
         return self.call_at(self.clock.monotonic_ns() + delay_ns, callback)
 
-    def run(self, timeout_ns: int | None) -> None:
-        """Wait until something is ready or due, at most ``timeout_ns`` (None: however long), and handle all of it."""
+    def run(self, timeout_ns: int | None, budget_ns: int | None = None) -> None:
+        """Wait until something is ready or due, at most ``timeout_ns`` (None: however long), and handle it.
+
+        Handlers of sockets are called for ``budget_ns`` (None: as long as it takes), and at least one; the rest come
+        first in the next turn.
+        """
         timers = self._timers
         if timers:
             next_ns = max(timers[0][0] - self.clock.monotonic_ns(), 0)
             timeout_ns = next_ns if timeout_ns is None else min(timeout_ns, next_ns)
         self._forgotten.clear()
-        for key, events in self._select(timeout_ns):
-            if key.fd not in self._forgotten:  # else an earlier handler of this round has closed it
-                key.data(events)
+        owed, self._again = self._again, {}
+        for key, events in self._select(0 if owed else timeout_ns):
+            owed[key.fd] = owed.get(key.fd, 0) | events
+        self._handle(owed, budget_ns)
         now_ns = self.clock.monotonic_ns()
         while timers and timers[0][0] <= now_ns:
             timer = heapq.heappop(timers)[2]
             if not timer.cancelled:
                 timer.callback()
+
+    def _handle(self, owed: dict[int, int], budget_ns: int | None) -> None:
+        end_ns = None if budget_ns is None else self.clock.monotonic_ns() + budget_ns
+        handlers = self._selector.get_map()
+        late = False
+        for fd, events in owed.items():
+            if fd in self._forgotten:  # an earlier handler of this round has closed it
+                continue
+            if late:
+                self._again[fd] = self._again.get(fd, 0) | events
+                continue
+            handlers[fd].data(events)
+            late = end_ns is not None and self.clock.monotonic_ns() >= end_ns
 
     def _select(self, timeout_ns: int | None) -> list[tuple[selectors.SelectorKey, int]]:
         if isinstance(self.clock, VirtualClock):  # its time does not pass while the selector waits

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections import Counter
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -77,6 +78,60 @@ def test_watching_again_replaces() -> None:
     right.send(b"x")
     reactor.run(0)
     assert heard == [f"first {WRITE}", f"second {READ}"]
+    reactor.close()
+    left.close()
+    right.close()
+
+
+class Slow(VirtualClock):
+    """Each reading takes a millisecond, as if handlers took that long."""
+
+    def monotonic_ns(self) -> int:
+        self.advance(1_000_000)
+        return super().monotonic_ns()
+
+
+def test_beyond_its_budget_a_turn_leaves_sockets_to_the_next_and_each_has_its_turn() -> None:
+    reactor = Reactor(Slow())
+    pairs = [socket.socketpair() for _ in range(10)]
+    called: list[int] = []
+    for number, (ours, theirs) in enumerate(pairs):
+        theirs.send(b"x")  # never read: all are ready all the time
+        reactor.watch(ours, READ, lambda _, number=number: called.append(number))  # type: ignore[misc]
+    turns = []
+    for _ in range(10):
+        before = len(called)
+        reactor.run(0, 3_000_000)
+        turns.append(len(called) - before)
+    assert turns == [3] * 10
+    assert set(Counter(called).values()) <= {2, 3, 4}
+    reactor.run(0, 0)
+    assert len(called) == 31  # one, whatever the budget
+    for ours, _ in pairs[:5]:
+        reactor.forget(ours)  # some of them owed their turn
+    reactor.run(0)
+    assert sorted(called[31:]) == [5, 6, 7, 8, 9]
+    reactor.close()
+    for pair in pairs:
+        for sock in pair:
+            sock.close()
+
+
+def test_a_handler_that_left_off_is_called_again_without_news() -> None:
+    reactor = Reactor(VirtualClock())
+    left, right = socket.socketpair()
+    heard: list[bytes] = []
+
+    def handle(_events: int) -> None:
+        heard.append(left.recv(1) if not heard else b"")
+        if len(heard) < 3:
+            reactor.again(left, READ)
+
+    reactor.watch(left, READ, handle)
+    right.send(b"x")
+    for _ in range(5):
+        reactor.run(10)
+    assert heard == [b"x", b"", b""]
     reactor.close()
     left.close()
     right.close()
