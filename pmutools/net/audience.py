@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from typing import Protocol
 
+from pmutools.flow import Segmentation
 from pmutools.net.udp import Target, UdpSocket
 
 
 class Sink(Protocol):
     """Takes the frames of the streams that it was given."""
 
-    def put(self, frame: bytes, mark: int, now_ns: int) -> bool:
-        """Take a frame, the one at ``mark`` in what is published; false if it was dropped at once."""
+    def put(self, frame: bytes, mark: int, now_ns: int, write: Segmentation | None = None) -> bool:
+        """Take a frame, the one at ``mark`` in what is published; false if it was dropped at once.
+
+        ``write`` says how its bytes go into a byte stream; datagrams are always whole.
+        """
 
 
 class Flushable(Protocol):
@@ -56,7 +60,7 @@ class UdpSink:
     def __init__(self, outbox: Outbox, where: Target) -> None:
         self.outbox, self.where = outbox, where
 
-    def put(self, frame: bytes, mark: int, now_ns: int) -> bool:
+    def put(self, frame: bytes, mark: int, now_ns: int, write: Segmentation | None = None) -> bool:
         self.outbox.put(frame, self.where, mark)
         return True
 

@@ -22,6 +22,7 @@ from pmutools import linux
 from pmutools.c37118.session import Served
 from pmutools.clock import Clock
 from pmutools.errors import SettingsError
+from pmutools.flow import Hangup
 from pmutools.net.audience import Audience, Flushable, Outbox, UdpSink
 from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
 from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
@@ -34,6 +35,8 @@ CFG_PERIOD_NS = 60_000_000_000
 HOUSEKEEPING_NS = 1_000_000_000
 COARSE_NS = 2_000_000
 """How long before a deadline waiting for sockets, in whole milliseconds, gives way to an exact sleep."""
+HANDLING_NS = 1_000_000
+"""Longest time in a row for what clients ask, before whoever serves can look after its deadlines."""
 _SHARES = 64
 """A period's configurations leave in so many portions, not in one burst."""
 _SENDING_RCVBUF = 4096
@@ -196,7 +199,7 @@ class Senders:
 
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         """Answer clients and repeat configurations; waits for something to do at most ``timeout_ns``."""
-        self._reactor.run(0 if self._events else timeout_ns)
+        self._reactor.run(0 if self._events else timeout_ns, HANDLING_NS)
         self._last_poll_ns = self._clock.monotonic_ns()
         events = self._events[:]
         self._events.clear()
@@ -221,6 +224,35 @@ class Senders:
         listening = self._outlets[outlet][1]
         if isinstance(listening, TcpOutlet):
             listening.disconnect(reset=reset)
+
+    def hang_up(self, stream: int, how: Hangup) -> int:
+        """Let TCP clients that have started a stream feel that it falls silent; returns how many were sent away.
+
+        With :attr:`~pmutools.flow.Hangup.REFUSE` the stream does not start again before :meth:`take_up`: commands to
+        start it are told (:attr:`ServerKind.REFUSED`) and not obeyed, and an endpoint of which all streams are refused
+        closes its port and sends everybody away. UDP clients see silence in any case.
+        """
+        if how is Hangup.SILENCE:
+            return 0
+        return sum(outlet.hang_up(idcode, how) for outlet, idcode in self._offers(stream))
+
+    def take_up(self, stream: int) -> None:
+        """End :attr:`~pmutools.flow.Hangup.REFUSE`: listen again on the same port, and obey those who start it.
+
+        A port that cannot be had is told (:attr:`ServerKind.NOT_LISTENING`) and tried again until it can.
+        """
+        for outlet, idcode in self._offers(stream):
+            outlet.take_up(idcode)
+
+    def _offers(self, stream: int) -> list[tuple[TcpOutlet, int]]:
+        """The outlets with connections that offer a stream, and its IDCODE there."""
+        return [
+            (outlet, idcode)
+            for _, outlet in self._outlets
+            if isinstance(outlet, TcpOutlet)
+            for idcode, handle in outlet.handles.items()
+            if handle == stream
+        ]
 
     def close(self) -> None:
         for _, outlet in self._outlets:

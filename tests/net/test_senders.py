@@ -7,8 +7,9 @@ import random
 import socket
 import struct
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
 
@@ -20,6 +21,7 @@ from pmutools.c37118 import Command, Frame, Framer, FrameType, StreamConfig, dec
 from pmutools.c37118.session import Outcome, served
 from pmutools.clock import VirtualClock
 from pmutools.errors import SettingsError, SourceError
+from pmutools.flow import Cut, Hangup, Segmentation
 from pmutools.net import outlet as outlet_module
 from pmutools.net import tcp
 from pmutools.net.dialogue import LinkKind
@@ -338,6 +340,88 @@ def test_a_flood_of_commands_is_bounded(code: int) -> None:
         server.until(lambda: len(other.hear()) == 3)
 
 
+def frames_of(code: int, count: int, idcode: int = 7) -> bytes:
+    return encode_command(idcode, code) * count
+
+
+FLOODS = {
+    "cfg2": frames_of(Command.SEND_CFG2, 100_000),
+    "start-stop": (START + encode_command(7, Command.STOP_DATA)) * 50_000,
+    "unknown": frames_of(0x0007, 100_000),
+    "garbage": bytes(1_800_000),
+    "false-syncs": b"\xaa\x41\x7f\xff" * 450_000,
+    "hidden": b"\xaa\x41\xff\xff\x00\x09" + frames_of(Command.SEND_CFG2, 100_000),
+}
+
+
+@pytest.mark.parametrize("kind", FLOODS)
+def test_a_flood_delays_nobody(kind: str) -> None:
+    """A hundred thousand commands as fast as they are taken, answers unread; another client is served meanwhile."""
+    left = memoryview(FLOODS[kind])
+    garbage = kind in ("garbage", "false-syncs")
+    with serving("tcp://127.0.0.1:0", queue_bytes=32_768) as server, clients(server, 2) as (flood, other):
+        started(server, other)
+        told: Counter[ServerKind | Outcome] = Counter()
+        late_ns, k = [], 0
+        while not (told[ServerKind.GARBAGE] if garbage else sum(told.values()) >= 100_000):
+            with suppress(BlockingIOError, ConnectionError):
+                left = left[flood.sock.send(left[: 1 << 18]) :]
+            deadline_ns = CLOCK.monotonic_ns() + 5 * MS
+            while events := server.senders.serve_until(deadline_ns):
+                assert len(events) <= outlet_module.COMMANDS + 2  # of one turn
+                told.update(event.kind for event in events)
+            late_ns.append(CLOCK.monotonic_ns() - deadline_ns)
+            server.publish(1, first=k)
+            k += 1
+            assert server.senders.queued_bytes <= 2 * 32_768
+            outlet = server.senders._outlets[server.outlet][1]
+            assert isinstance(outlet, outlet_module.TcpOutlet)
+            assert sum(len(client.unheard) for client in outlet._clients) * 18 <= 1 << 17
+            other.hear()
+        server.until(lambda: len(other.hear()) == k)
+        assert min(late_ns) >= 0
+        assert sorted(late_ns)[len(late_ns) * 9 // 10] < 10 * MS, sorted(late_ns)
+
+
+def test_many_flooding_clients_share_the_turns() -> None:
+    wire = frames_of(Command.SEND_CFG2, 5_000)
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 40) as joined:
+        for client in joined:
+            client.sock.send(wire)
+        late_ns = []
+        for _ in range(40):
+            deadline_ns = CLOCK.monotonic_ns() + 5 * MS
+            while events := server.senders.serve_until(deadline_ns):
+                server.events += events
+            late_ns.append(CLOCK.monotonic_ns() - deadline_ns)
+        assert sorted(late_ns)[30] < 5 * MS, late_ns
+        server.until(lambda: all(client.hear() for client in joined))  # each has its turn
+
+
+def test_a_flood_of_datagrams_is_taken_bit_by_bit() -> None:
+    """Datagrams full of commands, and of bytes that look like them: a turn obeys its measure, nothing is lost."""
+    with (
+        serving("udp+cmd://127.0.0.1:0") as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as flood,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        for _ in range(5):
+            flood.sendto(frames_of(0x0007, 500), server.address)
+            flood.sendto(b"\xaa\x41\x7f\xff" * 15_000, server.address)
+            flood.sendto(START[:-1], server.address)
+        other.sendto(b"\xaa\x41\x00\x12" + START, server.address)  # what follows no frame is not looked for
+        other.sendto(START, server.address)
+        turns = []
+        while Outcome.STARTED not in server.kinds():
+            events = server.senders.poll(100 * MS)
+            turns.append(len(events))
+            server.events += events
+            assert len(turns) < 1000
+        assert max(turns) <= outlet_module.COMMANDS
+        assert server.kinds().count(Outcome.UNKNOWN) == 2500
+        assert server.kinds().count(Outcome.STARTED) == 1
+
+
 def test_too_many_clients_are_turned_away(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outlet_module, "MAX_CLIENTS", 3)
     with serving("tcp://127.0.0.1:0") as server, clients(server, 4) as joined:
@@ -397,6 +481,167 @@ def test_clients_can_be_sent_away_and_come_back() -> None:
         server.until(lambda: client.hear() is not None and client.ended)
         with clients(server, 1):
             server.until(lambda: server.kinds().count(ServerKind.CONNECTED) == 2)
+
+
+# --- how frames are written
+
+
+def put(server: Server, number: int, write: Segmentation | None = None) -> None:
+    """Publish one frame to all who have started the stream, written as ``write`` says."""
+    frame = data_frame(CONFIG, number * 10**9, value=number)
+    for sink in server.senders._audience.sinks[server.handles[0]]:
+        sink.put(frame, 0, CLOCK.monotonic_ns(), write)
+    server.senders._flush()
+
+
+def test_pieces_leave_by_the_clock_and_answers_queue_behind_them() -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+        begun_ns = CLOCK.monotonic_ns()
+        put(server, 0, Segmentation(Cut.SPLIT, 3, 20 * MS))
+        put(server, 1)
+        client.say(encode_command(7, Command.SEND_CFG2))
+        server.until(lambda: Outcome.ANSWERED in server.kinds())
+        assert CLOCK.monotonic_ns() - begun_ns > 40 * MS or server.senders.queued_bytes
+        server.until(lambda: len(client.hear()) == 3)
+        assert CLOCK.monotonic_ns() - begun_ns >= 40 * MS
+        assert [frame.type for frame in client.frames] == [FrameType.DATA, FrameType.DATA, FrameType.CFG2]
+        begun_ns = CLOCK.monotonic_ns()
+        put(server, 2, Segmentation(Cut.STALL, gap_ns=30 * MS))
+        put(server, 3)
+        server.until(lambda: len(client.hear()) == 5)
+        assert CLOCK.monotonic_ns() - begun_ns >= 30 * MS
+
+
+def test_a_client_that_is_cut_off_goes_and_others_stay() -> None:
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 2) as (one, other):
+        one.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+        put(server, 0, Segmentation(Cut.STALL, gap_ns=20 * MS))
+        put(server, 1, Segmentation(Cut.RESET))  # takes effect by the clock
+        server.until(lambda: ServerKind.CUT_OFF in server.kinds())
+        server.until(lambda: one.hear() and one.ended)
+        assert [frame.data for frame in one.frames] == [data_frame(CONFIG, 0, value=0)]
+        assert one.framer.pending == len(one.frames[0].data) // 2
+        other.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+        put(server, 2, Segmentation(Cut.RESET, 4))  # at once
+        server.until(lambda: server.kinds().count(ServerKind.CUT_OFF) == 2)
+        server.until(lambda: other.hear() is not None and other.ended)
+        assert server.senders.audience(server.handles[0]) == 0
+
+
+def test_kept_frames_go_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "KEPT_NS", 30 * MS)
+    monkeypatch.setattr("pmutools.net.server.HOUSEKEEPING_NS", 10 * MS)
+    with serving("tcp://127.0.0.1:0") as server, clients(server, 1) as (client,):
+        client.say(START)
+        server.until(lambda: server.senders.audience(server.handles[0]) == 1)
+        put(server, 0, Segmentation(Cut.COALESCE, 5))
+        assert server.senders.queued_bytes
+        server.until(lambda: len(client.hear()) == 1)
+
+
+# --- streams that fall silent
+
+
+def started(server: Server, *joined: Client, idcode: int = 7) -> None:
+    """Have the clients start a stream; each has its own start told."""
+    told = server.kinds().count(Outcome.STARTED)
+    for client in joined:
+        client.say(encode_command(idcode, Command.START_DATA))
+    server.until(lambda: server.kinds().count(Outcome.STARTED) == told + len(joined))
+
+
+def refuses(server: Server) -> bool:
+    try:
+        socket.create_connection(server.address, timeout=1).close()
+    except ConnectionRefusedError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("how", [Hangup.FIN, Hangup.RST])
+def test_a_stream_is_hung_up_for_those_who_have_started_it(how: Hangup) -> None:
+    with serving("tcp://127.0.0.1:0", CONFIG, stream(9)) as server, clients(server, 3) as (one, both, other):
+        started(server, one, both)
+        started(server, both, other, idcode=9)
+        both.say(encode_command(7, 0x0007))  # FIN all the same, though a command waits unread
+        assert server.senders.hang_up(server.handles[0], Hangup.SILENCE) == 0
+        assert server.senders.hang_up(server.handles[0], how) == 2
+        for client in (one, both):
+            with pytest.raises(BlockingIOError if how is Hangup.FIN else ConnectionResetError):
+                assert client.sock.recv(1) == b""
+                raise BlockingIOError
+        server.until(lambda: server.kinds().count(ServerKind.DISCONNECTED) == 2)
+        assert server.senders.hang_up(server.handles[0], how) == 0
+        server.senders.take_up(server.handles[0])  # nothing was refused
+        assert server.senders.audience(server.handles[1]) == 1
+        with clients(server, 1) as (back,):
+            started(server, back)
+        assert not other.hear()
+        assert not other.ended
+
+
+def test_a_refused_stream_does_not_start_while_others_do() -> None:
+    with serving("tcp://127.0.0.1:0", CONFIG, stream(9)) as server, clients(server, 2) as (one, other):
+        senders, (seven, nine) = server.senders, server.handles
+        started(server, one)
+        started(server, other, idcode=9)
+        assert senders.hang_up(seven, Hangup.REFUSE) == 1
+        assert senders.hang_up(seven, Hangup.REFUSE) == 0
+        other.say(START + encode_command(7, Command.SEND_CFG2))
+        server.until(lambda: Outcome.ANSWERED in server.kinds())
+        refused = [event for event in server.events if event.kind is ServerKind.REFUSED]
+        assert [(event.idcode, event.code) for event in refused] == [(7, Command.START_DATA)]
+        assert (senders.audience(seven), senders.audience(nine)) == (0, 1)
+        senders.take_up(seven)
+        started(server, other)
+        assert senders.audience(seven) == 1
+
+
+def test_where_all_streams_are_refused_nobody_listens_until_one_is_taken_up() -> None:
+    with serving("tcp://127.0.0.1:0", CONFIG, stream(9)) as server, clients(server, 2) as (one, idle):
+        senders, (seven, nine) = server.senders, server.handles
+        started(server, one)
+        assert senders.hang_up(nine, Hangup.REFUSE) == 0
+        assert not refuses(server)
+        assert senders.hang_up(seven, Hangup.REFUSE) >= 2  # and those who have started nothing
+        assert refuses(server)
+        server.until(lambda: one.hear() is not None and one.ended and idle.hear() is not None and idle.ended)
+        for _ in range(2):
+            senders.take_up(nine)
+        with clients(server, 1) as (back,):
+            started(server, back, idcode=9)
+            back.say(START)
+            server.until(lambda: ServerKind.REFUSED in server.kinds())
+        for _ in range(2):  # again and again
+            assert senders.hang_up(nine, Hangup.REFUSE) in (0, 1)
+        assert refuses(server)
+        senders.take_up(seven)
+        assert not refuses(server)
+
+
+def test_a_port_taken_meanwhile_is_told_and_had_back_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet_module, "_LISTEN_AGAIN_NS", 20 * MS)
+    with serving("tcp://127.0.0.1:0") as server:
+        senders, (seven,) = server.senders, server.handles
+        senders.hang_up(seven, Hangup.REFUSE)
+        with socket.socket() as thief:
+            thief.bind(server.address)
+            thief.listen()
+            for _ in range(3):
+                senders.take_up(seven)
+            server.until(lambda: server.kinds() == [ServerKind.NOT_LISTENING])
+            assert "already in use" in server.events[0].detail
+            end_ns = CLOCK.monotonic_ns() + 50 * MS
+            while CLOCK.monotonic_ns() < end_ns:
+                server.events += senders.poll(5 * MS)
+        assert server.kinds() == [ServerKind.NOT_LISTENING]  # once
+        server.until(lambda: not refuses(server))
+        with clients(server, 1) as (client,):
+            started(server, client)
 
 
 # --- spontaneous
