@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from pmutools import linux
@@ -148,6 +149,59 @@ def test_a_failed_datagram_is_named_and_the_rest_go_out() -> None:
     frames = [b"0", b"1", b"x" * 70_000, b"3", b"4"]
     assert linux.SendBatch().send(sender.fileno(), frames, [good, port_0, good, good, port_0]) == [1, 2, 4]
     assert [datagram.data for datagram in linux.ReceiveBatch().receive(receiver.fileno())] == [b"0", b"3"]
+    receiver.close()
+    sender.close()
+
+
+def _columns(frames: list[bytes], where: list[linux.SockAddr | None]) -> linux.SendColumns:
+    sizes = np.array([len(frame) for frame in frames])
+    columns = linux.SendColumns(4)
+    columns.load(
+        np.frombuffer(b"".join(frames), np.uint8),
+        np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        sizes,
+        np.array([one.address if one else 0 for one in where], np.uint64),
+        np.array([len(one.raw) if one else 0 for one in where], np.uint32),
+    )
+    return columns
+
+
+@native
+@pytest.mark.realtime
+@pytest.mark.parametrize("connected", [False, True])
+def test_columns_keep_order_and_bytes_whatever_the_portions(connected: bool) -> None:
+    receiver, sender = _pair(socket.AF_INET, "127.0.0.1")
+    receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    address = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, receiver.getsockname())))
+    if connected:
+        sender.connect(receiver.getsockname())
+    frames = [bytes([k % 256]) * (1 + k % 90) for k in range(3000)]
+    columns, batch, got = _columns(frames, [None if connected else address] * len(frames)), linux.ReceiveBatch(), []
+    for first, last in ((0, 1), (1, 1), (1, 4), (4, 64), (64, 200), (200, 400)):
+        assert columns.send(sender.fileno(), first, last) == []
+        for _ in range(4):
+            got += [datagram.data for datagram in batch.receive(receiver.fileno())]
+    assert got == frames[:400]
+    assert columns.send(sender.fileno(), 400, 3000) == []  # three calls; what the receiver has no room for is lost
+    while heard := batch.receive(receiver.fileno()):
+        got += [datagram.data for datagram in heard]
+    assert got == frames[: len(got)]
+    with pytest.raises(IndexError):
+        columns.send(sender.fileno(), 2999, 3001)
+    receiver.close()
+    sender.close()
+
+
+@native
+@pytest.mark.realtime
+def test_a_failed_datagram_of_columns_is_named_and_the_rest_go_out() -> None:
+    receiver, sender = _pair(socket.AF_INET, "127.0.0.1")
+    good = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, receiver.getsockname())))
+    port_0 = linux.SockAddr(pack_sockaddr(Address(socket.AF_INET, ("127.0.0.1", 0))))
+    columns = _columns([b"0", b"1", b"x" * 70_000, b"3", b"4"], [good, port_0, good, good, port_0])
+    assert columns.send(sender.fileno(), 0, 5) == [1, 2, 4]
+    assert columns.send(sender.fileno(), 2, 4) == [2]
+    assert [datagram.data for datagram in linux.ReceiveBatch().receive(receiver.fileno())] == [b"0", b"3", b"3"]
     receiver.close()
     sender.close()
 

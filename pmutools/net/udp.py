@@ -56,6 +56,13 @@ class Batches:
     def __init__(self) -> None:
         self.receive = linux.ReceiveBatch()
         self.send = linux.SendBatch()
+        self._departures: linux.DepartureBatch | None = None
+
+    @property
+    def departures(self) -> linux.DepartureBatch:
+        if self._departures is None:  # few need it
+            self._departures = linux.DepartureBatch()
+        return self._departures
 
 
 class UdpSocket:
@@ -110,6 +117,7 @@ class UdpSocket:
             raise explain(error, f"udp://{wanted}") from None
         self.address = Address(wanted.family, sock.getsockname())
         self._flows: dict[bytes | tuple[str, int], Flow] = {}
+        self._stamps_departures = False
 
     def __enter__(self) -> UdpSocket:
         return self
@@ -229,6 +237,51 @@ class UdpSocket:
         except OSError:
             return False
         return True
+
+    def stamp_departures(self) -> bool:
+        """Have the kernel stamp what is sent from now on, and number it from 0; false where it cannot.
+
+        The stamps wait in the socket's error queue, within its receive buffer (which is raised for it, to some 40,000
+        stamps where permitted): read :meth:`departures` often. While any wait, a selector finds the socket ready.
+        """
+        if self._batches is None:
+            return False
+        try:
+            self._number_departures()
+        except OSError:
+            return False
+        self.rcvbuf_bytes = raise_rcvbuf(self._sock)
+        self._stamps_departures = True
+        return True
+
+    def restart_departures(self) -> None:
+        """Number what is sent from now on from 0 again: a failed send may have taken a number, or not.
+
+        Read :meth:`departures` before, where the old numbers matter.
+        """
+        if self._stamps_departures:
+            self._number_departures()
+
+    def departures(self) -> list[tuple[int, int]]:
+        """(number, UTC ns) of what has left since it was last asked: 32 bits, so it wraps; empty if nothing is stamped.
+
+        The stamp is taken as the datagram is handed to the driver of the network card.
+        """
+        if self._batches is None or not self._stamps_departures:
+            return []
+        read, fd = self._batches.departures.read, self._sock.fileno()
+        left: list[tuple[int, int]] = []
+        more = True
+        while more:
+            ids, stamps_ns, more = read(fd)
+            left += zip(ids.tolist(), stamps_ns.tolist(), strict=True)
+        return left
+
+    def _number_departures(self) -> None:
+        """Numbers begin at 0 when they are asked for anew."""
+        flags = linux.TX_SOFTWARE | linux.SOFTWARE | linux.OPT_TSONLY
+        for value in (flags, flags | linux.OPT_ID):
+            self._sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPING, value)
 
 
 _MULTICAST_TTL: dict[int, tuple[int, int]] = {

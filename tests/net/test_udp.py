@@ -148,6 +148,82 @@ def test_many_senders_do_not_grow_the_cache_for_ever(monkeypatch: pytest.MonkeyP
     receiver.close()
 
 
+# --- departures
+
+
+@native_only
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_each_datagram_is_stamped_as_it_leaves(host: str) -> None:
+    receiver, sender = UdpSocket(host, 0), UdpSocket(host, 0, rcvbuf_bytes=4096)
+    where = target(receiver.address)
+    sender.send([b"before"], [where])
+    assert sender.departures() == []
+    assert sender.stamp_departures()
+    before_ns = time.time_ns()
+    sender.send([b"x"] * 3000, [where] * 3000)
+    middle_ns = time.time_ns()
+    sender.send([b"y"], [where])
+    after_ns = time.time_ns()
+    left = sender.departures()
+    assert [number for number, _ in left] == list(range(3001))
+    stamps_ns = [stamp_ns for _, stamp_ns in left]
+    assert stamps_ns == sorted(stamps_ns)
+    assert before_ns <= stamps_ns[0] <= stamps_ns[2999] <= middle_ns <= stamps_ns[3000] <= after_ns
+    assert sender.departures() == []
+    arrivals = read(receiver, 3002)
+    assert [chunk.stamp_source for chunk in arrivals[-10:]] == [StampSource.KERNEL] * 10
+    sender.send([b"back"], [target(sender.address)])
+    assert [chunk.stamp_source for chunk in read(sender, 1)] == [StampSource.KERNEL]  # arrivals are stamped as before
+    receiver.close()
+    sender.close()
+
+
+@native_only
+def test_after_a_failed_send_the_numbers_can_begin_again() -> None:
+    receiver, sender = UdpSocket("127.0.0.1", 0), UdpSocket("127.0.0.1", 0)
+    sender.restart_departures()  # nothing is stamped: nothing happens
+    assert sender.stamp_departures()
+    where = target(receiver.address)
+    assert sender.send([b"0", b"x" * 70_000, b"1"], [where] * 3) == [1]
+    assert len(sender.departures()) == 2
+    sender.restart_departures()
+    sender.send([b"0", b"1"], [where] * 2)
+    assert [number for number, _ in sender.departures()] == [0, 1]
+    receiver.close()
+    sender.close()
+
+
+@native_only
+def test_errors_that_the_network_reports_are_no_departures() -> None:
+    receiver, sender = UdpSocket("127.0.0.1", 0), UdpSocket("127.0.0.1", 0)
+    sender._sock.setsockopt(socket.IPPROTO_IP, linux.IP_RECVERR, 1)  # reports of closed ports go to the same queue
+    assert sender.stamp_departures()
+    nobody, somebody = target(resolve("127.0.0.1", free_udp_port(), datagram=True)), target(receiver.address)
+    reported = 0
+    for k in range(20):
+        try:
+            sender.send([bytes([k])], [nobody if k % 2 else somebody])
+        except ConnectionRefusedError:
+            reported += 1
+    time.sleep(0.01)
+    left = sender.departures()
+    numbers = [number for number, _ in left]
+    assert len(numbers) >= 10
+    assert numbers == list(range(len(numbers)))
+    now_ns = time.time_ns()
+    assert all(0 <= now_ns - stamp_ns < 10**9 for _, stamp_ns in left)
+    receiver.close()
+    sender.close()
+
+
+def test_the_portable_path_stamps_no_departures() -> None:
+    with UdpSocket("127.0.0.1", 0, native=False) as sock:
+        assert not sock.stamp_departures()
+        sock.restart_departures()
+        sock.send([b"x"], [target(sock.address)])
+        assert sock.departures() == []
+
+
 # --- multicast
 
 
