@@ -51,6 +51,25 @@ def test_timer_slack_fifo_and_lock_either_work_or_say_why() -> None:
         assert reason == "None" or "for it" in reason
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux's schedulers")
+@pytest.mark.realtime
+@pytest.mark.parametrize("portable", ["0", "1"])
+def test_going_real_time_gets_what_it_may_and_says_what_it_did_not(portable: str) -> None:
+    out = run_python(
+        "from pmutools.realtime import go_realtime; import gc, os, resource\n"
+        "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
+        "for fifo in (False, True):\n"
+        "    missing = go_realtime(fifo=fifo, priority=5)\n"
+        "    is_fifo = os.sched_getscheduler(0) == os.SCHED_FIFO\n"
+        "    print(fifo, is_fifo, missing.fifo is None, gc.get_freeze_count() > 0, sep='|')\n"
+        "    assert all(reason is None or ': ' in reason for reason in missing), missing",
+        PMUTOOLS_PORTABLE=portable,
+    )
+    normal, asked = out.splitlines()
+    assert normal == "False|False|True|True"
+    assert asked in ("True|True|True|True", "True|False|False|True")
+
+
 def test_portable_by_environment() -> None:
     out = run_python(
         "from pmutools import linux; from pmutools.clock import SystemClock; c = SystemClock()\n"

@@ -26,7 +26,6 @@ from dcon.platform.schedule import TickGrid
 from dcon.session.codec import Timing
 from dcon.session.log import SessionWriter
 from dcon.settings import Settings, Site
-from pmutools import linux
 from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
 from pmutools.clock import Clock, SystemClock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError, SourceError
@@ -34,12 +33,12 @@ from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.receiver import Receivers
+from pmutools.realtime import go_realtime
 from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 SPIN_NS = 200_000
 CLOCK_CHECK_TICKS = 60
-FIFO_PRIORITY = 10
 COARSE_NS = 1_200_000
 """Selectors wait in whole milliseconds: the last stretch before a deadline is slept exactly."""
 LATEST_NS = NS
@@ -270,11 +269,9 @@ class Platform:
 
 
 def prepare(*, fifo: bool) -> None:
-    """Make this process fit for a fixed rhythm, as far as it may: no garbage to go over, little timer slack, FIFO."""
-    gc.collect()
-    gc.freeze()
-    linux.timer_slack()
-    if problem := linux.lock_memory():
-        LOG.info("memory is not locked: %s", problem)
-    if fifo and (problem := linux.fifo(FIFO_PRIORITY)):
-        LOG.warning("running at the normal scheduling policy: %s", problem)
+    """Make this process fit for a fixed rhythm, and log what could not be had."""
+    missing = go_realtime(fifo=fifo)
+    if missing.memory:
+        LOG.info("memory is not locked: %s", missing.memory)
+    if missing.fifo:
+        LOG.warning("running at the normal scheduling policy: %s", missing.fifo)
