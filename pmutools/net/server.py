@@ -29,7 +29,7 @@ from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
 from pmutools.net.reactor import Reactor
 from pmutools.net.sockets import Address, resolve
 from pmutools.net.tcp import QUEUE_BYTES
-from pmutools.net.udp import Batches, UdpSocket, target
+from pmutools.net.udp import Batches, UdpSocket, check_broadcast, target
 
 CFG_PERIOD_NS = 60_000_000_000
 HOUSEKEEPING_NS = 1_000_000_000
@@ -115,8 +115,9 @@ class Senders:
     def send_to(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
         """Send streams to a UDP address without being asked; returns the outlet's number.
 
-        ``iface`` and ``ttl`` of the endpoint choose how multicast leaves, ``source`` the address it comes from. Raises
-        SourceError for an unknown host or a source that is not local, SettingsError for an endpoint that is served.
+        ``iface`` and ``ttl`` of the endpoint choose how multicast leaves, ``source`` the address it comes from;
+        that also says on which network 255.255.255.255 is. Raises SourceError for an unknown host, a source that is not
+        local or a broadcast that cannot leave, SettingsError for an endpoint that is served.
         """
         if endpoint.scheme is not Scheme.UDP:
             raise SettingsError(
@@ -126,6 +127,7 @@ class Senders:
             raise SettingsError(f"{endpoint}: port 0 is nowhere to send to")
         where = target(resolve(scoped(endpoint.host, endpoint.iface), endpoint.port, datagram=True))
         box = self._box(where.address, endpoint)
+        check_broadcast(where.address, box.sock.address.host)
         for handle in streams:
             sink = UdpSink(box, where)
             self._audience.sinks[handle].append(sink)

@@ -6,6 +6,7 @@ taken, and sent, by one system call; the portable path does the same one by one,
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import socket
 import struct
@@ -282,6 +283,24 @@ class UdpSocket:
         flags = linux.TX_SOFTWARE | linux.SOFTWARE | linux.OPT_TSONLY
         for value in (flags, flags | linux.OPT_ID):
             self._sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPING, value)
+
+
+def check_broadcast(where: Address, local: str) -> None:
+    """Raise SourceError where ``where`` is a broadcast address and the system has no way there from ``local``.
+
+    255.255.255.255 is the network of the address bound to, or that of the default route. Addresses that are none pass.
+    """
+    if where.family != socket.AF_INET or is_multicast(where.host):
+        return
+    with socket.socket(where.family, socket.SOCK_DGRAM) as probe:  # to connect one sends nothing
+        probe.bind((local, 0))
+        if where.host != "255.255.255.255" and probe.connect_ex(where.sockaddr) != errno.EACCES:
+            return  # else it takes what only broadcast addresses ask for
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        try:
+            probe.connect(where.sockaddr)
+        except OSError as error:
+            raise explain(error, f"broadcast to {where} from {local}") from None
 
 
 _MULTICAST_TTL: dict[int, tuple[int, int]] = {

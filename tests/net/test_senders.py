@@ -697,6 +697,38 @@ def test_one_stream_to_a_group_and_to_an_address() -> None:
         assert owners == {(0,), (1,)}
 
 
+@pytest.mark.skipif(not linux.NATIVE, reason="Linux's loopback network")
+@pytest.mark.parametrize("destination", ["127.255.255.255", "255.255.255.255"])
+def test_a_broadcast_reaches_all_who_listen(destination: str) -> None:
+    with ExitStack() as stack:
+        ears = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        for ear in ears:
+            ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            ear.bind(("0.0.0.0", ears[0].getsockname()[1]))
+            ear.settimeout(2)
+        senders = stack.enter_context(Senders(CLOCK))
+        seven = senders.add(served(CONFIG))
+        port = ears[0].getsockname()[1]
+        senders.send_to(parse_endpoint(f"udp://{destination}:{port}?source=127.0.0.1"), [seven])
+        assert senders.publish([(seven, b"to all")]) == []
+        assert [ear.recvfrom(100)[0] for ear in ears] == [b"to all"] * 2
+
+
+@pytest.mark.skipif(not linux.NATIVE, reason="Linux's errors")
+def test_a_broadcast_that_cannot_leave_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreachable(self: socket.socket, address: object) -> None:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    with Senders(CLOCK) as senders:
+        seven = senders.add(served(CONFIG))
+        monkeypatch.setattr(socket.socket, "connect", unreachable)
+        for host in ("255.255.255.255", "127.255.255.255"):
+            with pytest.raises(SourceError, match=rf"broadcast to {host}:4713 from 0.0.0.0: no route to this network"):
+                senders.send_to(parse_endpoint(f"udp://{host}:4713"), [seven])
+        assert senders.audience(seven) == 0
+        senders.send_to(parse_endpoint("udp://127.0.0.1:4713"), [seven])  # no broadcast: not looked into
+
+
 def test_a_changed_configuration_is_what_is_answered_and_announced_from_then_on() -> None:
     port = free_udp_port()
     with (
