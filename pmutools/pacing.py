@@ -2,7 +2,7 @@
 
 Media time (ns) is the source's own time axis; the playback clock maps it to deadlines on the monotonic clock::
 
-    media(m) = media_ns + rate * (m - anchor_ns)        target(t) = anchor_ns + (t - media_ns) / rate
+    target(t) = anchor_ns + (t - media_ns) / rate
 
 Every deadline is computed from the one anchor, never from the deadline before it, so errors do not add up. A seek, a
 change of rate, a pause, a loop's wrap and a new file each make a new anchor. All of it is exact integer arithmetic on
@@ -11,18 +11,21 @@ arguments; the only clock is the caller's.
 
 from __future__ import annotations
 
-from array import array
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 
 @dataclass(frozen=True, slots=True)
 class Playback:
-    """The playback clock: a value; each operation gives the next one.
+    """The playback clock: a value.
 
-    ``anchor_ns`` (monotonic) and ``media_ns`` are one instant on both axes, ``rate`` is media seconds per second
-    (> 0), ``running`` is false while paused.
+    ``anchor_ns`` and ``media_ns`` are one instant on both axes, ``rate`` is media seconds per second (> 0),
+    ``running`` is false while paused. A seek, a pause, another rate: :func:`dataclasses.replace`.
     """
 
     anchor_ns: int
@@ -34,39 +37,20 @@ class Playback:
         if self.rate <= 0:
             raise ValueError(f"playback rate {self.rate} is not above 0")
 
-    def media_at(self, now_ns: int) -> int:
-        """Media time at a monotonic time, rounded down."""
-        if not self.running:
-            return self.media_ns
-        return self.media_ns + (now_ns - self.anchor_ns) * self.rate.numerator // self.rate.denominator
+    def target_ns(self, media_ns: int) -> int:
+        """When a frame at ``media_ns`` is due (were it not paused), rounded down."""
+        return self.anchor_ns + (media_ns - self.media_ns) * self.rate.denominator // self.rate.numerator
 
-    def target_ns(self, media_ns: int, delay_ns: int = 0) -> int | None:
-        """Monotonic deadline of a frame at ``media_ns``, or None while paused.
+    def targets_ns(self, media_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """:meth:`target_ns` of media times (N,) within some hours of each other, the first one the earliest."""
+        up, down, low_ns = self.rate.denominator, self.rate.numerator, int(media_ns[0])
+        whole, rest = divmod((low_ns - self.media_ns) * up, down)
+        targets: npt.NDArray[np.int64] = self.anchor_ns + whole + (rest + (media_ns - low_ns) * up) // down
+        return targets
 
-        ``delay_ns`` is wall time on top (network delay), so it is not scaled by the rate.
-        """
-        if not self.running:
-            return None
-        rate = self.rate
-        return self.anchor_ns + (media_ns - self.media_ns) * rate.denominator // rate.numerator + delay_ns
-
-    def pause(self, now_ns: int) -> Playback:
-        return replace(self, anchor_ns=now_ns, media_ns=self.media_at(now_ns), running=False)
-
-    def resume(self, now_ns: int) -> Playback:
-        """Go on from the same media time; no effect while running."""
-        return self if self.running else replace(self, anchor_ns=now_ns, running=True)
-
-    def with_rate(self, now_ns: int, rate: Fraction) -> Playback:
-        return replace(self, anchor_ns=now_ns, media_ns=self.media_at(now_ns), rate=rate)
-
-    def seek(self, now_ns: int, media_ns: int) -> Playback:
-        """Go to ``media_ns``: also for a loop's wrap, a skipped gap and the next file."""
-        return replace(self, anchor_ns=now_ns, media_ns=media_ns)
-
-    def shift(self, by_ns: int) -> Playback:
-        """All deadlines later by ``by_ns`` of wall time (earlier if negative): to follow a stepped UTC clock."""
-        return replace(self, anchor_ns=self.anchor_ns + by_ns)
+    def media_from(self, target_ns: int) -> int:
+        """The first media time that is due at ``target_ns`` or later."""
+        return self.media_ns - (self.anchor_ns - target_ns) * self.rate.numerator // self.rate.denominator
 
 
 class LatenessSummary(NamedTuple):
@@ -85,11 +69,14 @@ _BINS = 1024
 """Up to 63 ns one bin a nanosecond, then 32 bins an octave: the last bin begins at 67.6 s, and holds what is beyond."""
 
 
-def _bin(value_ns: int) -> int:
-    if value_ns < _LINEAR:
-        return max(value_ns, 0)
-    shift = value_ns.bit_length() - _FRACTION_BITS - 1
-    return min((shift << _FRACTION_BITS) + (value_ns >> shift), _BINS - 1)
+def _bins(values_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The bins of values (N,)."""
+    values = np.maximum(values_ns, 0)
+    shift = np.frexp(values.astype(np.float64))[1] - _FRACTION_BITS - 1  # bit length, exact below 2**53 ns
+    bins: npt.NDArray[np.int64] = np.where(
+        values < _LINEAR, values, (shift << _FRACTION_BITS) + (values >> np.maximum(shift, 0))
+    )
+    return np.minimum(bins, _BINS - 1)
 
 
 def _bin_edge(index: int) -> int:
@@ -101,48 +88,39 @@ def _bin_edge(index: int) -> int:
 
 
 class Lateness:
-    """Histogram of lateness in 8 KiB, whatever the count; histograms of the same ``miss_ns`` can be merged.
+    """Histograms of lateness, one a stream in 4 KiB each, whatever the count.
 
-    What is late by more than ``miss_ns`` counts as a miss: customarily half the reporting interval. What left early
-    (sent with a batch) counts as not late.
+    What is late by more than its stream's ``miss_ns`` (S,) counts as a miss: customarily half the reporting interval.
     """
 
-    __slots__ = ("_bins", "count", "max_ns", "miss_ns", "misses")
+    def __init__(self, miss_ns: Sequence[int]) -> None:
+        streams = len(miss_ns)
+        self._miss_ns = np.array(miss_ns, np.int64)
+        self._bins = np.zeros((streams, _BINS), np.uint32)
+        self._misses = np.zeros(streams, np.int64)
+        self._max_ns = np.zeros(streams, np.int64)
 
-    def __init__(self, miss_ns: int) -> None:
-        self.miss_ns = miss_ns
-        self.count = 0
-        self.misses = 0
-        self.max_ns = 0
-        self._bins = array("Q", bytes(8 * _BINS))
+    def add(self, streams: npt.NDArray[np.integer[Any]], late_ns: npt.NDArray[np.int64]) -> None:
+        """Count frames (N,) of ``streams`` that left ``late_ns`` after their time; what left early counts as 0."""
+        np.add.at(self._bins.reshape(-1), streams * np.int64(_BINS) + _bins(late_ns), 1)
+        missed = late_ns > self._miss_ns[streams]
+        np.add.at(self._misses, streams[missed], 1)
+        most = late_ns > self._max_ns[streams]  # few are: a maximum is slow to take
+        np.maximum.at(self._max_ns, streams[most], late_ns[most])
 
-    def add(self, late_ns: int) -> None:
-        self.count += 1
-        self._bins[_bin(late_ns)] += 1
-        if late_ns > self.max_ns:
-            self.max_ns = late_ns
-        if late_ns > self.miss_ns:
-            self.misses += 1
+    def summary(self, stream: int | None = None) -> LatenessSummary:
+        """Of one stream, or of all together."""
+        chosen = slice(None) if stream is None else slice(stream, stream + 1)
+        bins = self._bins[chosen].sum(axis=0, dtype=np.int64)
+        most = int(self._max_ns[chosen].max(initial=0))
+        frames, misses = int(bins.sum()), int(self._misses[chosen].sum())
+        return LatenessSummary(frames, misses, _percentile(bins, 50, most), _percentile(bins, 99, most), most)
 
-    def merge(self, other: Lateness) -> None:
-        """Add what ``other`` counted."""
-        if other.miss_ns != self.miss_ns:
-            raise ValueError(f"misses beyond {other.miss_ns} ns do not add to misses beyond {self.miss_ns} ns")
-        self.count += other.count
-        self.misses += other.misses
-        self.max_ns = max(self.max_ns, other.max_ns)
-        for index, count in enumerate(other._bins):
-            self._bins[index] += count
 
-    def percentile_ns(self, percent: float) -> int:
-        """The smallest bin edge that at least ``percent`` of the values do not exceed; 0 of nothing."""
-        needed = percent / 100 * self.count
-        seen = 0
-        for index, count in enumerate(self._bins):
-            seen += count
-            if count and seen >= needed:
-                return min(_bin_edge(index), self.max_ns) if index < _BINS - 1 else self.max_ns
+def _percentile(bins: npt.NDArray[np.int64], percent: float, most_ns: int) -> int:
+    """The smallest bin edge that at least ``percent`` of the values do not exceed; 0 of nothing."""
+    seen = np.cumsum(bins)
+    if not seen[-1]:
         return 0
-
-    def summary(self) -> LatenessSummary:
-        return LatenessSummary(self.count, self.misses, self.percentile_ns(50), self.percentile_ns(99), self.max_ns)
+    index = int(np.searchsorted(seen, max(percent / 100 * int(seen[-1]), 1)))
+    return min(_bin_edge(index), most_ns) if index < _BINS - 1 else most_ns

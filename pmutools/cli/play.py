@@ -19,7 +19,7 @@ from pmutools.errors import SettingsError
 if TYPE_CHECKING:
     from pmutools.impair.profile import Profile
     from pmutools.net.endpoint import Endpoint
-    from pmutools.tools.player.play import StreamResult
+    from pmutools.tools.player.results import StreamResult
     from pmutools.tools.window import Moment
 
 MS = 1_000_000
@@ -69,6 +69,7 @@ def _speed(text: str) -> Fraction:
 @_fault("corrupt", "P%", "Damage frames.")
 @_fault("disable", "NAME@T1..T2", "Switch a stream off from T1 to T2 s of stream time.")
 @click.option("--seed", type=Parsed(parsers.integer(0, 2**64 - 1)), metavar="N", help="Same seed, same faults.")
+@click.option("--emulate", type=click.IntRange(1, 65534), metavar="N", help="N PMUs that share the source's streams.")
 @click.option("--ledger", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.parquet")
 @DURATION
 @common
@@ -89,6 +90,7 @@ def command(
     cfg_period_ns: int,
     impair: str | None,
     seed: int | None,
+    emulate: int | None,
     ledger: Path | None,
     duration_ns: int | None,
     as_json: bool,
@@ -103,9 +105,10 @@ def command(
     """
     from pmutools.clock import SystemClock
     from pmutools.net.endpoint import parse_endpoint
+    from pmutools.tools.player.cast import as_recorded, emulated
     from pmutools.tools.player.ledger import LedgerWriter
     from pmutools.tools.player.play import Options, Player
-    from pmutools.tools.player.script import study
+    from pmutools.tools.player.reel import at_interval, at_rate, record
     from pmutools.tools.player.stamps import StampPolicy
     from pmutools.tools.recordings import losses, open_recordings
     from pmutools.tools.window import Window
@@ -122,8 +125,6 @@ def command(
         listen=[_listening(parse_endpoint(url)) for url in listen],
         policy=StampPolicy(stamp),
         speed=speed,
-        interval_ns=interval_ns,
-        fps=fps,
         loops=loops,
         cfg_period_ns=cfg_period_ns,
         profile=_profile(impair, faults),
@@ -133,25 +134,31 @@ def command(
     if ledger is not None:
         spare(ledger, files)
     source = open_recordings(files)
-    script = study(Watched(source, talk).items(), timing, Window(start, end), select, exclude)
+    reel = record(Watched(source, talk).blocks(), timing, Window(start, end), select, exclude)
     lost = losses(source)
-    for pattern in options.profile.unmatched(stream.names for stream in script.streams):
-        talk.say(f"no stream is called {pattern!r}; there are {', '.join(stream.name for stream in script.streams)}")
+    if interval_ns is not None:
+        reel = at_interval(reel, interval_ns)
+    if fps is not None:
+        reel = at_rate(reel, fps)
+    cast = emulated(reel, emulate, options.seed or 0) if emulate else as_recorded(reel)
+    for pattern in options.profile.unmatched((part.name, *part.aliases) for part in cast.parts):
+        talk.say(f"no stream is called {pattern!r}; there are {', '.join(part.name for part in cast.parts)}")
     with (
         interruptible() as stop,
         Player(
-            script,
-            lambda: open_recordings(files).items(),
+            cast,
             options,
             SystemClock(spin_ns=100_000),
             stop=stop,
             tell=lambda event: talk.say(f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip()),
+            warn=talk.say,
+            stamp_departures=ledger is not None,
         ) as player,
     ):
         for url in (*to, *listen):
-            talk.say(f"{len(script.streams)} streams, {sum(s.frames for s in script.streams)} data frames: {url}")
+            talk.say(f"{len(cast.parts)} streams, {len(reel.rows)} data frames: {url}")
         with LedgerWriter(ledger) if ledger is not None else nullcontext() as rows:
-            player.play(rows, lambda sent: talk.progress(f"{sent} frames sent"))
+            player.play(rows, lambda: talk.progress(f"{player.results.sent} frames sent"))
         stopped = stop()
     if as_json:
         click.echo(json.dumps({"streams": [result.to_json() for result in player.results], "losses": lost}))
@@ -178,7 +185,7 @@ def _listening(endpoint: Endpoint) -> Endpoint:
 
 def _told(result: StreamResult) -> str:
     fates = ", ".join(f"{count} {fate}" for fate, count in result.fates.items()) or "nothing due"
-    late = result.lateness.summary()
+    late = result.late
     p50, p99, most = (f"{ns / 1000:.0f} us" for ns in (late.p50_ns, late.p99_ns, late.max_ns))
     return f"  {result.name:<16} {fates}; late p50 {p50}, p99 {p99}, max {most}, {late.misses} misses"
 

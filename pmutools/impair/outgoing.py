@@ -34,6 +34,10 @@ class Outgoing(NamedTuple):
     fate: Fate = Fate.SENT
     delay_ns: int = 0
     marks: tuple[str, ...] = ()
+    config: object = None
+    write: object = None
+    hangup: object = __import__("pmutools.flow").flow.Hangup.SILENCE
+    notice: bool = True
 
     @property
     def faults(self) -> str:

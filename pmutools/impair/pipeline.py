@@ -68,6 +68,7 @@ class Pipeline:
         *,
         config: StreamConfig | None = None,
         aliases: Iterable[str] = (),
+        stations=(),
     ) -> None:
         self.stream = stream
         self.names = (stream, *aliases)
@@ -121,7 +122,20 @@ class Pipeline:
         self._config = config
         self._build(self._stages, ("corrupt",))
 
-    def apply(self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None) -> tuple[Outgoing, ...]:
+    @property
+    def clear(self):
+        return self._enabled and self._short_cut is not None and self._short_cut.__name__ == "_no_delay"
+
+    def delays_ns(self, indices):
+        import numpy as np
+
+        if not self._enabled or self._short_cut is None:
+            return None
+        return np.array([max(0, self._short_cut(i)) for i in indices.tolist()], np.int64)
+
+    def apply(
+        self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None, stamp_ns=None
+    ) -> tuple[Outgoing, ...]:
         """What becomes of a frame; a row for each copy, also of those that will not be sent.
 
         Parameters

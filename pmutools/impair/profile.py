@@ -49,6 +49,7 @@ class Action(NamedTuple):
     """Whom it concerns, and for ``fault`` what is set."""
     argument: str = ""
     at_ns: int = 0
+    values: tuple = ()
 
 
 STREAM_VERBS = ("enable", "disable", "fault")
@@ -76,6 +77,10 @@ class Profile:
                 for option, setting in rule.settings:
                     stages = stages.changed(option, setting)
         return stages
+
+    @property
+    def player_timeline(self):
+        return [a for a in self.timeline if a.verb not in STREAM_VERBS]
 
     def then(self, other: Profile) -> Profile:
         """This profile with ``other`` (say, the command line's options) on top."""

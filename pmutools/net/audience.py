@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from typing import Protocol
+from collections.abc import Callable, Hashable, Sequence
+from typing import NamedTuple, Protocol
 
+import numpy as np
+import numpy.typing as npt
+
+from pmutools import linux
 from pmutools.flow import Segmentation
 from pmutools.net.udp import Target, UdpSocket
+
+I64 = npt.NDArray[np.int64]
+NO_ROW = -1
+_REMEMBERED = 1 << 18
+"""Datagrams whose departure stamps are waited for: two seconds of 100,000/s."""
 
 
 class Sink(Protocol):
@@ -15,7 +24,7 @@ class Sink(Protocol):
     def put(self, frame: bytes, mark: int, now_ns: int, write: Segmentation | None = None) -> bool:
         """Take a frame, the one at ``mark`` in what is published; false if it was dropped at once.
 
-        ``write`` says how its bytes go into a byte stream; datagrams are always whole.
+        ``write`` says how it goes into a byte stream, where not whole and at once.
         """
 
 
@@ -26,15 +35,43 @@ class Flushable(Protocol):
         """Do what was put off; returns the marks of the frames that failed in it."""
 
 
-class Outbox:
-    """What one UDP socket sends with its next flush; it enters itself in ``dirty`` when there is something to flush."""
+class Addresses(NamedTuple):
+    """Where N datagrams go: the addresses of their ``sockaddr`` in memory, the lengths of those, and the targets."""
 
-    def __init__(self, sock: UdpSocket, dirty: list[Flushable]) -> None:
+    names: npt.NDArray[np.uint64]
+    lengths: npt.NDArray[np.uint32]
+    targets: npt.NDArray[np.object_]
+
+    @classmethod
+    def of(cls, targets: Sequence[Target]) -> Addresses:
+        objects = np.empty(len(targets), np.object_)
+        objects[:] = targets
+        return cls(
+            np.array([where.sockaddr.address for where in targets], np.uint64),
+            np.array([len(where.sockaddr.raw) for where in targets], np.uint32),
+            objects,
+        )
+
+    def take(self, rows: I64) -> Addresses:
+        return Addresses(self.names[rows], self.lengths[rows], self.targets[rows])
+
+
+class Outbox:
+    """What one UDP socket sends: single frames with its next flush, and columns of frames, loaded and sent in runs.
+
+    It enters itself in ``dirty`` when there is something to flush. With ``stamped`` the kernel stamps departures, and
+    :attr:`marks` remembers whose they are.
+    """
+
+    def __init__(self, sock: UdpSocket, dirty: list[Flushable], *, stamped: bool = False) -> None:
         self.sock = sock
         self._dirty = dirty
         self._frames: list[bytes] = []
         self._targets: list[Target] = []
         self._marks: list[int] = []
+        self._columns = linux.SendColumns() if sock.native else None
+        self._loaded: tuple[npt.NDArray[np.uint8], I64, I64, Addresses]
+        self.departures = Departures(sock) if stamped and sock.stamp_departures() else None
 
     def put(self, frame: bytes, where: Target, mark: int) -> None:
         if not self._frames:
@@ -47,9 +84,57 @@ class Outbox:
         if not self._frames:
             return []
         failed = self.sock.send(self._frames, self._targets)
+        if self.departures is not None:
+            self.departures.sent(np.full(len(self._frames), NO_ROW), failed)
         marks = [self._marks[index] for index in failed]
         self._frames, self._targets, self._marks = [], [], []
         return marks
+
+    def load(self, wire: npt.NDArray[np.uint8], at: I64, nbytes: I64, to: Addresses) -> None:
+        """Make datagrams ready: ``nbytes`` from ``at`` on (N,) in ``wire``, each with its own address."""
+        self._loaded = (wire, at, nbytes, to)
+        if self._columns is not None:
+            self._columns.load(wire, at, nbytes, to.names, to.lengths)
+
+    def send(self, first: int, last: int, marks: I64) -> list[int]:
+        """Send the loaded datagrams ``first`` to ``last - 1``; returns those that the system would not take.
+
+        ``marks`` (N,) is what their departures are to be known by.
+        """
+        if self._columns is not None:
+            failed = self._columns.send(self.sock.fileno(), first, last)
+        else:
+            wire, at, nbytes, to = self._loaded
+            frames = [wire[at[k] : at[k] + nbytes[k]].tobytes() for k in range(first, last)]
+            failed = [first + k for k in self.sock.send(frames, to.targets[first:last].tolist())]
+        if self.departures is not None:
+            self.departures.sent(marks[first:last], [k - first for k in failed])
+        return failed
+
+
+class Departures:
+    """The kernel's stamps of when datagrams left, matched with whose they are."""
+
+    def __init__(self, sock: UdpSocket) -> None:
+        self._sock = sock
+        self._marks = np.full(_REMEMBERED, NO_ROW, np.int64)
+        self._next = 0
+
+    def sent(self, marks: I64, failed: Sequence[int]) -> None:
+        """Datagrams were handed to the kernel, those of ``marks`` in this order."""
+        if failed:  # whether those were counted depends on where they failed: begin a new count
+            self._sock.restart_departures()
+            self._marks[:], self._next = NO_ROW, 0
+            return
+        self._marks[(self._next + np.arange(len(marks))) % _REMEMBERED] = marks
+        self._next = self._next + len(marks) & 0xFFFF_FFFF
+
+    def read(self) -> tuple[I64, I64]:
+        """(mark, POSIX UTC ns) of the stamps that have come; marks below 0 are of frames nobody asks for."""
+        found = np.array(self._sock.departures(), np.int64).reshape(-1, 2)
+        marks = self._marks[found[:, 0] % _REMEMBERED]
+        known = marks != NO_ROW
+        return marks[known], found[known, 1]
 
 
 class UdpSink:
@@ -70,14 +155,21 @@ class Audience:
 
     def __init__(self) -> None:
         self.sinks: list[list[Sink]] = []
+        self.version = 0
+        """Counts the changes."""
         self._shares: dict[tuple[int, Hashable], tuple[Sink, set[Hashable]]] = {}
+
+    def add(self, handle: int, sink: Sink) -> None:
+        """From now on ``sink`` gets the stream."""
+        self.sinks[handle].append(sink)
+        self.version += 1
 
     def start(self, handle: int, key: Hashable, client: Hashable, make: Callable[[], Sink]) -> None:
         """``client`` wants the stream at the sink called ``key``, which ``make`` makes for the first who does."""
         share = self._shares.get((handle, key))
         if share is None:
             share = self._shares[handle, key] = (make(), set())
-            self.sinks[handle].append(share[0])
+            self.add(handle, share[0])
         share[1].add(client)
 
     def stop(self, handle: int, key: Hashable, client: Hashable) -> None:
@@ -88,3 +180,4 @@ class Audience:
         if not share[1]:
             del self._shares[handle, key]
             self.sinks[handle].remove(share[0])
+            self.version += 1

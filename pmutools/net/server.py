@@ -18,12 +18,15 @@ import socket
 from collections.abc import Iterable, Sequence
 from types import TracebackType
 
+import numpy as np
+
 from pmutools import linux
 from pmutools.c37118.session import Served
 from pmutools.clock import Clock
 from pmutools.errors import SettingsError
 from pmutools.flow import Hangup
 from pmutools.net.audience import Audience, Flushable, Outbox, UdpSink
+from pmutools.net.cargo import I64, Cargo, Frames, Table
 from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
 from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
 from pmutools.net.reactor import Reactor
@@ -40,6 +43,7 @@ HANDLING_NS = 1_000_000
 _SHARES = 64
 """A period's configurations leave in so many portions, not in one burst."""
 _SENDING_RCVBUF = 4096
+_NONE = np.zeros(0, np.int64)
 
 
 class Senders:
@@ -53,6 +57,8 @@ class Senders:
         Bytes that may wait for one TCP client; frames beyond are dropped for it, and counted.
     native
         False takes the portable path: a system call a datagram.
+    stamp_departures
+        Have the kernel stamp what leaves unasked, for :meth:`departures`.
     """
 
     def __init__(
@@ -62,12 +68,14 @@ class Senders:
         cfg_period_ns: int | None = CFG_PERIOD_NS,
         queue_bytes: int = QUEUE_BYTES,
         native: bool = linux.NATIVE,
+        stamp_departures: bool = False,
     ) -> None:
         self._clock = clock
         self._native = native
+        self._stamp_departures = stamp_departures
         self._queue_bytes = queue_bytes
         self._batches = Batches() if native else None
-        self._reactor = Reactor(clock)
+        self.reactor = self._reactor = Reactor(clock)
         self._audience = Audience()
         self._events: list[ServerEvent] = []
         self._dirty: list[Flushable] = []
@@ -78,6 +86,7 @@ class Senders:
         self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
         self._boxes: dict[tuple[str, str | None, int | None], Outbox] = {}
         self._spontaneous: list[list[UdpSink]] = []
+        self._table: Table | None = None
         self._last_poll_ns = 0
         self._share = 0
         if cfg_period_ns is not None:
@@ -100,6 +109,7 @@ class Senders:
         """Offer a stream; returns its handle. Nobody gets it before :meth:`send_to` or :meth:`listen`."""
         self._served.append(stream)
         self._audience.sinks.append([])
+        self._audience.version += 1
         self._spontaneous.append([])
         return len(self._served) - 1
 
@@ -130,7 +140,7 @@ class Senders:
         check_broadcast(where.address, box.sock.address.host)
         for handle in streams:
             sink = UdpSink(box, where)
-            self._audience.sinks[handle].append(sink)
+            self._audience.add(handle, sink)
             self._spontaneous[handle].append(sink)
         self._outlets.append(({}, None))
         return len(self._outlets) - 1
@@ -186,6 +196,30 @@ class Senders:
         for mark, (stream, frame) in enumerate(frames):
             failed += [mark for sink in sinks[stream] if not sink.put(frame, mark, now_ns)]
         return failed + self._flush()
+
+    def load(self, frames: Frames) -> Cargo:
+        """Make frames ready for those who are to have them now; unloads what was loaded before."""
+        if self._table is None or self._table.version != self._audience.version:
+            self._table = Table(self._audience)
+        return Cargo(frames, self._table)
+
+    def stale(self, cargo: Cargo) -> bool:
+        """Whether someone has come or gone since ``cargo`` was loaded: load it again."""
+        return cargo.version != self._audience.version
+
+    def send(self, cargo: Cargo, first: int, last: int) -> list[int]:
+        """Send frames ``first`` to ``last - 1`` of a cargo, now; as :meth:`publish`, at the cost of a column.
+
+        Returns the rows that a destination did not take, once for each destination.
+        """
+        failed = cargo.send(first, last, self._clock.monotonic_ns())
+        return failed + self._flush() if self._dirty else failed
+
+    def departures(self) -> tuple[I64, I64]:
+        """(mark, POSIX UTC ns) of frames whose departure the kernel has stamped since this was last asked."""
+        found = [box.departures.read() for box in self._boxes.values() if box.departures is not None]
+        marks, times = zip(*found, strict=True) if found else ((), ())
+        return np.concatenate([_NONE, *marks]), np.concatenate([_NONE, *times])
 
     def announce(self, streams: Iterable[int] | None = None) -> None:
         """Send the configurations of spontaneous streams (default: all), stamped with the present time."""
@@ -283,7 +317,7 @@ class Senders:
         if box is None:
             sock = UdpSocket(local, 0, rcvbuf_bytes=_SENDING_RCVBUF, batches=self._batches, native=self._native)
             sock.send_via(iface=way[1], ttl=way[2])
-            box = self._boxes[way] = Outbox(sock, self._dirty)
+            box = self._boxes[way] = Outbox(sock, self._dirty, stamped=self._stamp_departures)
         return box
 
     def _await_share(self) -> None:

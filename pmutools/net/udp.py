@@ -99,6 +99,7 @@ class UdpSocket:
         group = is_multicast(wanted.host)
         if group and sys.platform == "win32":  # binding to a group is refused there
             wanted = resolve("::" if wanted.family == socket.AF_INET6 else "0.0.0.0", port, datagram=True)
+        self.native = native
         self._batches = (batches or Batches()) if native else None
         self._sock = sock = socket.socket(wanted.family, socket.SOCK_DGRAM)
         try:

@@ -21,8 +21,9 @@ from pmutools.c37118.framer import Frame
 from pmutools.formats import open_source
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.tools.describe import describe
+from pmutools.tools.player.cast import as_recorded
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.script import study
+from pmutools.tools.player.reel import at_interval, record
 
 pytestmark = [pytest.mark.peer, pytest.mark.realtime]
 
@@ -33,11 +34,11 @@ INTERVAL_NS = 40_000_000
 @contextmanager
 def served(path: Path) -> Iterator[int]:
     """A recording on a TCP port of loopback; plays from the first start command on."""
-    script = study(open_source(path).items())
+    reel = at_interval(record(open_source(path).blocks()), INTERVAL_NS)
     over = threading.Event()
-    options = Options(listen=[parse_endpoint("tcp://127.0.0.1:0")], interval_ns=INTERVAL_NS)
-    clock = EarlyClock(script.first_due_ns)
-    player = Player(script, lambda: open_source(path).items(), options, clock, stop=over.is_set)
+    options = Options(listen=[parse_endpoint("tcp://127.0.0.1:0")])
+    clock = EarlyClock(reel.first_due_ns)
+    player = Player(as_recorded(reel), options, clock, stop=over.is_set)
     address = player.senders.local(0)
     assert address is not None
     with playing(player, over):

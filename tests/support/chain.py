@@ -26,9 +26,10 @@ from pmutools.formats import open_sink, open_source
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.timebase import NS
 from pmutools.tools.live import LiveSource
+from pmutools.tools.player.cast import as_recorded
 from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.script import study
+from pmutools.tools.player.reel import record
 from pmutools.tools.reader import Reading, read
 
 TRANSPORTS = ("udp", "udp+cmd", "tcp", "tcp+udp", "tcp, cut anew")
@@ -38,7 +39,7 @@ _LEAD_NS = 30_000_000
 
 
 class EarlyClock(SystemClock):
-    """UTC moved by less than a second, so that a script's first frame is due at once and tests wait for nothing."""
+    """UTC moved by less than a second, so that a reel's first frame is due at once and tests wait for nothing."""
 
     def __init__(self, first_due_ns: int) -> None:
         super().__init__()
@@ -87,18 +88,18 @@ class Chain:
 
 def pass_through(path: Path, transport: str, out: Path, *, frames_per_s: int = 1500, seed: int = 1) -> Chain:
     """Play ``path`` faster than it was recorded and read it into ``out``, until all frames have come."""
-    script = study(open_source(path).items())
-    total = sum(stream.frames for stream in script.streams)
-    span_s = Fraction(max(s.last_due_ns for s in script.streams) - script.first_due_ns, NS)
+    reel = record(open_source(path).blocks())
+    total = len(reel.rows)
+    span_s = Fraction(reel.length_ns, NS)
     speed = max(span_s * frames_per_s / total, Fraction(1)).limit_denominator(1000)
-    clock = EarlyClock(script.first_due_ns)
+    clock = EarlyClock(reel.first_due_ns)
     over = threading.Event()
     patience_ns = SystemClock().monotonic_ns() + round(PATIENCE_S * NS)
 
     def player(**endpoints: Sequence[str]) -> Player:
         chosen = {name: tuple(map(parse_endpoint, urls)) for name, urls in endpoints.items()}
         options = Options(speed=speed, **chosen)  # type: ignore[arg-type]
-        return Player(script, lambda: open_source(path).items(), options, clock, stop=over.is_set)
+        return Player(as_recorded(reel), options, clock, stop=over.is_set)
 
     def reader(url: str) -> LiveSource:
         source = LiveSource([url], stop=lambda: has(source, total) or clock.monotonic_ns() > patience_ns)
@@ -117,7 +118,7 @@ def pass_through(path: Path, transport: str, out: Path, *, frames_per_s: int = 1
                 return Chain(sender, *run(source))
     scheme, _, cut = transport.partition(",")
     data = f"&data={free_udp_port()}" if scheme == "tcp+udp" else ""
-    query = f"?idcode={script.streams[0].config.idcode}{data}"
+    query = f"?idcode={reel.tracks[0].config.idcode}{data}"
     sender = player(listen=[f"{scheme}://{LOOPBACK}:0{query}"])
     address = sender.senders.local(0)
     assert address is not None

@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from support.live import data_frame
 
 from pmutools.c37118 import (
@@ -24,14 +25,17 @@ from pmutools.c37118 import (
 )
 from pmutools.c37118.session import Outcome, Served
 from pmutools.clock import VirtualClock
-from pmutools.flow import Flow, StampSource
+from pmutools.flow import Flow, Hangup, StampSource
+from pmutools.formats.source import gather
 from pmutools.impair.profile import Profile, profile_of_options
+from pmutools.net.cargo import Frames
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.timebase import NS, from_ns, slot_time_ns, to_ns
+from pmutools.tools.player.cast import Cast, as_recorded
 from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.script import Script, study
+from pmutools.tools.player.reel import I64, Reel, at_interval, at_rate, record
 from pmutools.tools.player.stamps import StampPolicy
 from pmutools.tools.window import Window
 
@@ -115,6 +119,13 @@ class Sent(NamedTuple):
         return decode_prefix(self.frame).type
 
 
+class Loaded(NamedTuple):
+    """What the stage was given to send, and for how many."""
+
+    frames: Frames
+    counts: I64
+
+
 @dataclass
 class Stage:
     """Stands for :class:`~pmutools.net.server.Senders`: takes down what is published, and when.
@@ -130,6 +141,7 @@ class Stage:
     sent: list[Sent] = field(default_factory=list)
     offered: list[Served] = field(default_factory=list)
     announced: list[tuple[int, int]] = field(default_factory=list)
+    gates: list[tuple[int, int, Hangup | None]] = field(default_factory=list)
     closed: bool = False
     queued_bytes: int = 0
     cost_ns: int = 0
@@ -167,6 +179,28 @@ class Stage:
         self.clock.advance(self.cost_ns)
         return failed
 
+    def load(self, frames: Frames) -> Loaded:
+        return Loaded(frames, np.where(frames.wanted, self.listeners, 0))
+
+    def stale(self, cargo: Loaded) -> bool:
+        return False
+
+    def send(self, cargo: Loaded, first: int, last: int) -> list[int]:
+        """All at once, as one system call does."""
+        rows = [row for row in range(first, last) if cargo.frames.wanted[row]]
+        frames = cargo.frames
+        return [rows[k] for k in self.publish((int(frames.stream[row]), frames.frame(row)) for row in rows)]
+
+    def departures(self) -> tuple[I64, I64]:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+
+    def hang_up(self, handle: int, how: Hangup) -> int:
+        self.gates.append((self.now_ns, handle, how))
+        return 1
+
+    def take_up(self, handle: int) -> None:
+        self.gates.append((self.now_ns, handle, None))
+
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         return self.serve_until(self.clock.monotonic_ns() + (timeout_ns or 0))
 
@@ -192,11 +226,15 @@ def started(idcode: int = 7) -> ServerEvent:
 class Played:
     """A run in virtual time that is over."""
 
-    script: Script
+    cast: Cast
     stage: Stage
     player: Player
     began_ns: int
     """UTC when it began."""
+
+    @property
+    def reel(self) -> Reel:
+        return self.cast.reel
 
     @property
     def data(self) -> list[Sent]:
@@ -208,7 +246,7 @@ class Played:
 
     def stamps(self, stream: int = 0) -> list[int]:
         """Stamps of the data frames sent, POSIX UTC ns."""
-        config = self.script.streams[stream].config
+        config = self.reel.tracks[self.cast.parts[stream].track].config
         return [stamp_ns(sent.frame, config) for sent in self.data if sent.stream == stream]
 
     def numbers(self, stream: int = 0) -> list[int]:
@@ -217,16 +255,17 @@ class Played:
     @property
     def fates(self) -> dict[str, int]:
         """Over all streams."""
-        total: dict[str, int] = {}
-        for result in self.player.results:
-            for fate, count in result.fates.items():
-                total[fate] = total.get(fate, 0) + count
-        return total
+        return self.player.results.fates()
 
 
 def faults(*pairs: str) -> Profile:
     """``faults("loss=5%", "drop=3")``, as on the command line."""
     return profile_of_options((name, value) for name, _, value in (pair.partition("=") for pair in pairs))
+
+
+def reel_of(messages: list[Message], *choices: Any, **named: Any) -> Reel:
+    """The reel of a recording; arguments as of :func:`record`."""
+    return record(gather(messages), *choices, **named)
 
 
 def play(
@@ -238,6 +277,9 @@ def play(
     timing: str | None = None,
     select: Sequence[str] = (),
     exclude: Sequence[str] = (),
+    interval_ns: int | None = None,
+    fps: int | None = None,
+    cast: Callable[[Reel], Cast] = as_recorded,
     ledger: Path | None = None,
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
@@ -245,17 +287,21 @@ def play(
     """Play ``messages`` to the end; ``options`` are those of :class:`Options`, ``policy`` and ``speed`` as text."""
     clock = clock or VirtualClock()
     stage = stage or Stage(clock)
-    script = study(messages, timing, window, select, exclude)
+    reel = reel_of(messages, timing, window, select, exclude)
+    if interval_ns is not None:
+        reel = at_interval(reel, interval_ns)
+    if fps is not None:
+        reel = at_rate(reel, fps)
     chosen = Options(**({"to": [NOWHERE]} | options))
     chosen = replace(chosen, policy=StampPolicy(chosen.policy), speed=Fraction(chosen.speed))
     began_ns = clock.realtime_ns()
-    with Player(script, lambda: messages, chosen, clock, stop=stop, senders=stage) as player:  # type: ignore[arg-type]
+    with Player(cast(reel), chosen, clock, stop=stop, senders=stage) as player:  # type: ignore[arg-type]
         if ledger is None:
             player.play()
         else:
             with LedgerWriter(ledger) as rows:
                 player.play(rows)
-    return Played(script, stage, player, began_ns)
+    return Played(player.cast, stage, player, began_ns)
 
 
 def config_of(sent: Sent) -> StreamConfig:

@@ -25,11 +25,13 @@ from pmutools.c37118.demux import Loss
 from pmutools.clock import SystemClock
 from pmutools.errors import PmuError
 from pmutools.formats import open_sink, open_source
+from pmutools.formats.source import gather
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.tools.inventory import take_inventory
 from pmutools.tools.live import LiveSource
+from pmutools.tools.player.cast import as_recorded
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.script import study
+from pmutools.tools.player.reel import record
 from pmutools.tools.reader import read
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")  # a user would see it on stderr
@@ -259,7 +261,7 @@ def test_anything_that_a_server_sends_is_read_and_accounted_for(pieces: list[byt
 def test_anything_that_a_client_sends_leaves_the_player_alone(pieces: list[bytes], scheme: str) -> None:
     messages: Any = recording(stream(), 3)
     options = Options(listen=[parse_endpoint(f"{scheme}://127.0.0.1:0")], duration_ns=30_000_000)
-    with Player(study(messages), lambda: messages, options, SystemClock()) as player:
+    with Player(as_recorded(record(gather(messages))), options, SystemClock()) as player:
         address = player.senders.local(0)
         assert address is not None
         kind = socket.SOCK_STREAM if scheme == "tcp" else socket.SOCK_DGRAM

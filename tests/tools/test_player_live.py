@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from support.chain import EarlyClock, playing
 from support.frames import command_frame
-from support.playing import MS, START_NS, number, recording, stream
+from support.playing import MS, START_NS, number, recording, reel_of, stream
 from support.recordings import FLOW
 
 from pmutools.c37118 import (
@@ -34,9 +34,9 @@ from pmutools.c37118.frames import wire_values
 from pmutools.flow import StampSource
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.timebase import from_ns
+from pmutools.tools.player.cast import as_recorded
 from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.script import study
 
 pytestmark = pytest.mark.realtime
 
@@ -93,10 +93,10 @@ class Client:
 @contextmanager
 def serving(messages: list[Message], ledger: Path | None = None, **options: Any) -> Iterator[tuple[Player, int]]:
     """A player that listens on a TCP port of loopback; told to stop when left."""
-    script = study(messages)
+    reel = reel_of(messages)
     over = threading.Event()
     chosen = Options(listen=[parse_endpoint("tcp://127.0.0.1:0")], **options)
-    player = Player(script, lambda: messages, chosen, EarlyClock(script.first_due_ns), stop=over.is_set)
+    player = Player(as_recorded(reel), chosen, EarlyClock(reel.first_due_ns), stop=over.is_set)
     address = player.senders.local(0)
     assert address is not None
     rows = LedgerWriter(ledger) if ledger else None
@@ -162,7 +162,7 @@ def test_a_slow_client_delays_nobody() -> None:
     assert {len(frame.data) for frame in quick.frames} == {len(messages[0].frame.data)}
     (result,) = player.results
     assert result.fates == {"sent": 1000}, "one of two took each"
-    assert result.lateness.summary().p99_ns < 100 * MS, "a second would be the slow one's doing"
+    assert result.late.p99_ns < 100 * MS, "a second would be the slow one's doing"
 
 
 def test_a_client_that_comes_late_gets_what_is_sent_from_then_on(tmp_path: Path) -> None:

@@ -6,8 +6,22 @@ import tracemalloc
 from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
 import pytest
-from support.playing import MS, START_NS, Played, Stage, at, faults, interleaved, play, recording, started, stream
+from support.playing import (
+    MS,
+    START_NS,
+    Played,
+    Stage,
+    at,
+    faults,
+    interleaved,
+    play,
+    recording,
+    reel_of,
+    started,
+    stream,
+)
 
 from pmutools.c37118 import FrameType, decode_config, decode_prefix
 from pmutools.c37118.session import Served
@@ -16,10 +30,11 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.impair.pipeline import Pipeline
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.outlet import ServerEvent
+from pmutools.pacing import Playback
 from pmutools.timebase import NS, slot, slot_time_ns
-from pmutools.tools.player.plan import plan
-from pmutools.tools.player.script import cues, study
-from pmutools.tools.player.stamps import StampPolicy, timeline
+from pmutools.tools.player.cast import as_recorded
+from pmutools.tools.player.plan import Plan
+from pmutools.tools.player.stamps import StampPolicy
 from pmutools.tools.window import Window, parse_moment
 
 LISTEN = parse_endpoint("tcp://127.0.0.1:4712")
@@ -60,13 +75,13 @@ def test_no_drift_over_an_hour(rate: int, speed: str) -> None:
     count = 3600 * rate // 50
     slots = [50 * k for k in range(count)]  # every 50th frame, to keep the test short
     played = play(recording(stream(rate=rate), count, slots=slots), clock=clock(), speed=speed)
-    first = played.script.first_due_ns
+    first = played.reel.first_due_ns
     expected = [int(slot_time_ns(rate * (START_NS // NS) + s, Fraction(rate)) // 1000 * 1000 - first) for s in slots]
     times = played.times()
     offsets = [time - times[0] for time in times]
     for offset, stream_ns in zip(offsets, expected, strict=True):
         assert abs(offset - stream_ns / Fraction(speed)) <= 1000 / Fraction(speed) + 1, "TIME_BASE is 1 us"
-    assert played.player.results[0].lateness.max_ns == 0
+    assert played.player.results[0].late.max_ns == 0
 
 
 def test_a_slow_send_delays_no_later_frame() -> None:
@@ -93,7 +108,7 @@ def test_a_stall_is_caught_up_with_in_order_and_counted() -> None:
     late = [time - due for time, due in zip(utc(played), played.stamps(), strict=True)]
     assert late[50] == 300 * MS
     assert all(not value for value in late[:50] + late[70:])
-    assert played.player.results[0].lateness.misses == sum(value > 10 * MS for value in late)
+    assert played.player.results[0].late.misses == sum(value > 10 * MS for value in late)
 
 
 def test_speed_scales_send_times_not_stamps() -> None:
@@ -103,9 +118,9 @@ def test_speed_scales_send_times_not_stamps() -> None:
 
 
 def test_wall_time_is_exact_however_long_it_plays() -> None:
-    script = study(recording(stream(), 2))
-    line = timeline(script, StampPolicy.SHIFT, NOW_NS, speed=Fraction(1, 3))
-    assert line.offset_ns(10**17 + 1) == 3 * 10**17 + 3
+    clock = Playback(0, 0, Fraction(1, 3))
+    assert clock.target_ns(10**17 + 1) == 3 * 10**17 + 3
+    assert clock.targets_ns(np.array([10**17, 10**17 + 1])).tolist() == [3 * 10**17, 3 * 10**17 + 3]
 
 
 def test_interval_sets_the_spacing_of_each_stream_and_leaves_the_stamps() -> None:
@@ -275,19 +290,19 @@ def test_start_and_end_cut_by_stamp_and_the_rest_is_due_now() -> None:
 def test_indices_count_over_the_source_whatever_part_is_played_and_over_its_loops() -> None:
     window = Window(parse_moment("1"), parse_moment("1.1"))
     source = recording(stream(), 100)
-    script = study(source, None, window)
-    assert [(cue.number, cue.place) for cue in cues(script, source)] == [(50 + k, k) for k in range(5)]
-    assert (script.streams[0].total, script.streams[0].frames) == (100, 5)
+    reel = reel_of(source, None, window)
+    assert reel.rows.number.tolist() == [50 + k for k in range(5)]
+    assert (reel.tracks[0].total, reel.tracks[0].frames) == (100, 5)
 
 
 def test_chosen_streams_alone_decide_what_is_due_first() -> None:
     source = interleaved(recording(stream(1), 100), recording(stream(2, name="LATE"), 100, first_slot=500))
     played = play(source, clock=clock(), select=["LATE"])
-    assert [s.name for s in played.script.streams] == ["LATE"]
+    assert [t.name for t in played.reel.tracks] == ["LATE"]
     assert 0 <= played.stamps()[0] - NOW_NS < NS
     assert played.stage.now_ns < 4 * NS
-    assert [s.name for s in play(source, exclude=["LATE"]).script.streams] == ["PMU 1"]
-    assert [s.name for s in play(source, select=["1"]).script.streams] == ["PMU 1"]
+    assert [s.name for s in play(source, exclude=["LATE"]).reel.tracks] == ["PMU 1"]
+    assert [s.name for s in play(source, select=["1"]).reel.tracks] == ["PMU 1"]
 
 
 def test_a_name_that_fits_no_stream_is_told_with_those_there_are() -> None:
@@ -303,7 +318,7 @@ def test_a_name_that_fits_no_stream_is_told_with_those_there_are() -> None:
 
 def test_streams_of_one_name_are_told_apart() -> None:
     source = interleaved(recording(stream(1, name="N"), 2), recording(stream(2, name="N"), 2))
-    assert [s.name for s in study(source).streams] == ["N", "N#2"]
+    assert [t.name for t in reel_of(source).tracks] == ["N", "N#2"]
 
 
 def test_several_streams_keep_their_place_relative_to_each_other() -> None:
@@ -366,12 +381,13 @@ def test_at_the_end_clients_have_two_seconds_for_what_waits_for_them(takes: int,
 def test_what_waits_to_be_sent_is_a_window_of_the_source() -> None:
     """Not all of it, whatever was read ahead or might have been held back."""
     source = recording(stream(), 20_000)
-    script = study(source)
-    line = timeline(script, StampPolicy.SHIFT, NOW_NS)
-    pipelines = [Pipeline(faults("delay=normal(30,5)"), "PMU 7", 1)]
+    cast = as_recorded(reel_of(source))
+    plan = Plan(cast, StampPolicy.SHIFT, [Pipeline(faults("delay=normal(30,5)"), "PMU 7", 1)], NOW_NS)
     tracemalloc.start()
     try:
-        count = sum(1 for _ in plan(script, lambda: source, line, pipelines))
+        count = 0
+        while (next_ns := plan.next_ns()) is not None:
+            count += len(plan.until(next_ns + 10 * MS))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -197,5 +197,6 @@ def test_what_was_converted_plays_as_the_original(tmp_path: Path) -> None:
     items: Any = list(open_source(tmp_path / "table.parquet").items())
     played = play(items)
     assert [number(sent.frame) for sent in played.data] == [*range(50)]
-    assert played.script.by_arrival
-    assert [s.name for s in played.script.streams] == ["TABLE"]
+    late = [played.began_ns + left - stamp for left, stamp in zip(played.times(), played.stamps(), strict=True)]
+    assert set(late) == {3_000_000}, "the table has the arrivals"
+    assert [t.name for t in played.reel.tracks] == ["TABLE"]

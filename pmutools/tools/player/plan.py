@@ -1,45 +1,37 @@
-"""What leaves when: a script on its timeline, loop after loop, through the fault pipelines. No clock, no socket."""
+"""What leaves when: a reel on its way through time, loop after loop, through the fault pipelines. No clock, no socket.
+
+Two times. *Stream time* is that of the recording: the position in it, plus ``round_ns`` for each loop played before.
+*Offsets* are wall time from the start of play. The playback clock maps one to the other; a seek, a pause, another speed
+and the wrap of an A-B loop each give it a new anchor, and every offset is computed from the last anchor alone. Delays
+are wall time, and are added to offsets.
+"""
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import count
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
 from typing import NamedTuple
 
-from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.demux import Loss, Message
+import numpy as np
+import numpy.typing as npt
+
+from pmutools import timebase
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
-from pmutools.tools.player.script import Cue, Script, cues
-from pmutools.tools.player.stamps import Timeline
+from pmutools.impair.profile import Action
+from pmutools.pacing import Playback
+from pmutools.timebase import NS
+from pmutools.tools.player.cast import Cast
+from pmutools.tools.player.dress import Dressed, dress
+from pmutools.tools.player.reel import I64
+from pmutools.tools.player.sheet import EMPTY, FATES, Extra, Sheet, clean, joined
+from pmutools.tools.player.stamps import StampPolicy, on_grid, shifted
 
-Items = Callable[[], Iterable[Message | Loss]]
-"""Opens the source anew."""
-
-SKEW_FRAMES = 1 << 18
-"""Frames read ahead at most to bring streams of different rates together, where frames are due by their number."""
-
-
-class Due(NamedTuple):
-    """A copy of a frame on its way; ``stamp_ns`` (POSIX UTC) is what it carries, ``source_ns`` what was recorded."""
-
-    offset_ns: int
-    order: int
-    stream: int
-    out: Outgoing
-    source_ns: int
-    stamp_ns: int
-    config: StreamConfig
-
-
-class _Staged(NamedTuple):
-    """A cue of the ``loop``-th round with the stream time at which it is due."""
-
-    stream_ns: int
-    order: int
-    cue: Cue
-    loop: int
+_FATE_CODES = {fate: code for code, fate in enumerate(FATES)}
+_BUCKET_NS = 10_000_000
+"""What waits for its time is sorted into buckets of this length."""
 
 
 class _Origin(NamedTuple):
@@ -47,88 +39,462 @@ class _Origin(NamedTuple):
 
     source_ns: int
     stamp_ns: int
-    config: StreamConfig
+    edition: int
 
 
-def plan(script: Script, items: Items, line: Timeline, pipelines: Sequence[Pipeline], loops: int = 1) -> Iterator[Due]:
-    """All copies of all frames, also of those that will not be sent, in the order in which they are to leave.
+class Plan:
+    """The plan of a run, made as far as it is asked for.
 
-    Equal offsets leave in the order of the source. ``loops`` 0: for ever.
+    Parameters
+    ----------
+    now_ns
+        POSIX UTC: the run begins here, with ``shift`` at most a second later. With ``shift`` the first frame is due at
+        its own new stamp (plus its recorded latency), so latency at the receiver is what it was in the recording;
+        ``now-grid`` begins at a reporting instant. :attr:`start_utc_ns` says when, offset 0.
+    loops
+        0: for ever.
+    timeline
+        Actions that concern the player itself, by stream time.
+    marks
+        Whether anyone wants the ledger's lists of faults.
     """
-    route = _Route(script, line, pipelines)
-    waiting: list[Due] = []
-    staged = _staged(script, items, line, loops)
-    for frame in _in_order(staged, script, loops) if line.by_index else staged:
-        offset_ns = line.offset_ns(frame.stream_ns)
-        while waiting and waiting[0].offset_ns < offset_ns:
-            yield heapq.heappop(waiting)
-        for due in route.through(frame, offset_ns):
-            heapq.heappush(waiting, due)
-    for due in route.end():
-        heapq.heappush(waiting, due)
-    while waiting:
-        yield heapq.heappop(waiting)
+
+    def __init__(
+        self,
+        cast: Cast,
+        policy: StampPolicy,
+        pipelines: Sequence[Pipeline],
+        now_ns: int,
+        *,
+        speed: Fraction = Fraction(1),
+        loops: int = 1,
+        timeline: Sequence[Action] = (),
+        marks: bool = True,
+    ) -> None:
+        self.cast, self.policy, self.loops = cast, policy, loops
+        self._reel = cast.reel
+        self._playback = Playback(0, 0, speed)
+        self._route = _Route(cast, pipelines, marks=marks)
+        self._timeline = deque(timeline)
+        self._totals = np.array([track.total for track in self._reel.tracks], np.int64)
+        self._planned_ns = 0
+        self._cursor_ns = 0
+        self._loop = 0
+        self._stop_ns: int | None = None
+        self._waiting: dict[int, list[Sheet]] = {}
+        self.between_ns: tuple[int, int] | None = None
+        """Positions A and B of a loop within the recording."""
+        self.ended = False
+        """Nothing more comes from the recording; copies that are delayed may still wait."""
+        self.start_utc_ns = 0
+        self._shift_ns = 0
+        self.start_utc_ns = self._aligned(now_ns)
+
+    # --- where it is
+
+    @property
+    def position_ns(self) -> int:
+        """Position in the recording up to which everything is planned."""
+        return self._cursor_ns - self._round_start(self._loop)
+
+    @property
+    def loop(self) -> int:
+        return self._loop
+
+    @property
+    def speed(self) -> Fraction:
+        return self._playback.rate
+
+    @property
+    def paused(self) -> bool:
+        return not self._playback.running
+
+    def next_ns(self) -> int | None:
+        """When something is to leave, or to be done, next; None while nothing is."""
+        times = [sheet.offset_ns[0] for sheet in self._waiting.get(min(self._waiting, default=0), ())]
+        if self._playback.running and not self.ended:
+            position = self.cast.next_position(self.position_ns)
+            until_ns = self._until_ns()
+            base_ns = self._round_start(self._loop)
+            stream_ns = until_ns if position is None else min(base_ns + position, until_ns)
+            times.append(self._playback.target_ns(stream_ns))
+        return int(min(times)) if times else None
+
+    # --- going on
+
+    def until(self, offset_ns: int) -> Sheet:
+        """The copies that are to leave before ``offset_ns`` and were not given before, in the order in which they do.
+
+        Copies that will not be sent are among them. Equal offsets leave in the order of the source.
+        """
+        fresh: list[Sheet] = []
+        while self._playback.running and not self.ended:
+            bound_ns = self._playback.media_from(offset_ns)
+            to_ns = min(bound_ns, self._until_ns())
+            if to_ns > self._cursor_ns:
+                fresh.append(self._play(to_ns))
+            if not self._turn():
+                break
+        self._planned_ns = max(self._planned_ns, offset_ns)
+        due = [self._part(sheet.in_order(), offset_ns) for sheet in fresh if len(sheet)]
+        waited = self._due(offset_ns)
+        if not len(waited) and len(due) == 1:
+            return due[0]
+        return joined([waited, *due]).in_order()
+
+    def _part(self, sheet: Sheet, offset_ns: int) -> Sheet:
+        """What leaves before ``offset_ns``; the rest waits."""
+        last = int(sheet.offset_ns.searchsorted(offset_ns))
+        if last == len(sheet):
+            return sheet
+        self._wait(sheet.take(slice(last, None)))
+        return sheet.take(slice(0, last))
+
+    def _turn(self) -> bool:
+        """Do what is to be done where the cursor is; false if there is nothing."""
+        if self._stop_ns is not None and self._cursor_ns >= self._stop_ns:
+            self._stop_ns = None
+            self._playback = Playback(self._here_ns(), self._cursor_ns, self.speed, running=False)
+        elif self._timeline and self._timeline[0].at_ns <= self._cursor_ns:
+            self.act(self._timeline.popleft(), self._here_ns())
+        elif self.between_ns is not None and self.position_ns >= self.between_ns[1]:
+            self._loop += 1
+            self._go(self._here_ns(), self._round_start(self._loop) + self.between_ns[0])
+        elif self._cursor_ns >= self._round_end() and not self._last_round:
+            self._loop += 1
+        elif self._last_round and self.cast.next_position(self.position_ns) is None:
+            self._end()
+        else:
+            return False
+        return True
+
+    @property
+    def _last_round(self) -> bool:
+        return self.between_ns is None and self.loops > 0 and self._loop >= self.loops - 1
+
+    def _until_ns(self) -> int:
+        """Stream time up to which rows follow each other without anything else to be done."""
+        stops = [self._round_end()]
+        if self.between_ns is not None:
+            stops.append(self._round_start(self._loop) + self.between_ns[1])
+        if self._timeline:
+            stops.append(self._timeline[0].at_ns)
+        if self._stop_ns is not None:
+            stops.append(self._stop_ns)
+        return max(min(stops), self._cursor_ns)
+
+    def _round_start(self, loop: int) -> int:
+        return loop * self._reel.round_ns.numerator // self._reel.round_ns.denominator
+
+    def _round_end(self) -> int:
+        return self._round_start(self._loop + 1)
+
+    def _here_ns(self) -> int:
+        """The offset of the cursor."""
+        return self._playback.target_ns(self._cursor_ns)
+
+    def _play(self, to_ns: int) -> Sheet:
+        """What becomes of the rows from the cursor to ``to_ns``."""
+        base_ns, reel = self._round_start(self._loop), self._reel
+        rows, parts, position = self.cast.between(self._cursor_ns - base_ns, to_ns - base_ns)
+        self._cursor_ns = to_ns
+        if not len(rows):
+            return EMPTY
+        stream_ns = position + base_ns
+        offsets = self._playback.targets_ns(stream_ns)
+        stamps = self._stamps(rows, parts, offsets)
+        whole = self.policy is StampPolicy.SHIFT and reel.fps is None
+        dressed = dress(
+            self.cast, rows, parts, None if self.policy is StampPolicy.KEEP else stamps, whole_seconds=whole
+        )
+        index = reel.rows.number[rows] + self._loop * self._totals[reel.rows.track[rows]]
+        return self._route.through(rows, parts, index, offsets, stream_ns, stamps, dressed)
+
+    def _stamps(self, rows: I64, parts: npt.NDArray[np.int32], offsets: I64) -> I64:
+        """What the rows' frames are to carry, POSIX UTC ns."""
+        stamps = self._reel.rows.stamp_ns[rows]
+        if self.policy is StampPolicy.KEEP:
+            return self._reel.rows.source_ns[rows]
+        if self.policy is StampPolicy.SHIFT:
+            return shifted(stamps, self._reel, self._loop, self._shift_ns)
+        times = self.start_utc_ns + offsets
+        if self.policy is StampPolicy.NOW:
+            return times
+        editions = self._reel.rows.edition[rows]
+        for edition in np.unique(editions):
+            chosen = editions == edition
+            if rate := self._rate(int(edition)):
+                times[chosen] = on_grid(times[chosen], rate)
+        return times
+
+    def _rate(self, edition: int) -> Fraction:
+        return Fraction(self._reel.fps) if self._reel.fps is not None else self._reel.editions[edition].rate
+
+    def _wait(self, sheet: Sheet) -> None:
+        """Keep copies until their time comes."""
+        sheet = sheet.in_order()
+        buckets = sheet.offset_ns // _BUCKET_NS
+        if not len(sheet):
+            return
+        if buckets[0] == buckets[-1]:
+            self._waiting.setdefault(int(buckets[0]), []).append(sheet)
+            return
+        edges = np.flatnonzero(np.diff(buckets)) + 1
+        for first, last in zip([0, *edges], [*edges, len(sheet)], strict=True):
+            piece = sheet.take(slice(first, last)).compact()
+            self._waiting.setdefault(int(buckets[first]), []).append(piece)
+
+    def _due(self, offset_ns: int) -> Sheet:
+        """What waits and leaves before ``offset_ns``."""
+        if not self._waiting:
+            return EMPTY
+        keys = sorted(key for key in self._waiting if key * _BUCKET_NS < offset_ns)
+        if not keys:
+            return EMPTY
+        found = joined([sheet for key in keys for sheet in self._waiting.pop(key)]).in_order()
+        last = int(np.searchsorted(found.offset_ns, offset_ns))
+        if last < len(found):
+            self._waiting[int(found.offset_ns[last]) // _BUCKET_NS] = [found.take(slice(last, None))]
+            found = found.take(slice(0, last))
+        return found
+
+    def _end(self) -> None:
+        self.ended = True
+        self._wait(self._route.end())
+
+    # --- being told
+
+    def act(self, action: Action, offset_ns: int) -> None:
+        """Do a player's verb at ``offset_ns``, or as soon after what is planned already as can be."""
+        offset_ns = max(offset_ns, self._planned_ns)
+        match action.verb:
+            case "pause":
+                if action.values:
+                    self._go(offset_ns + int(action.values[0]), self._cursor_ns)
+                else:
+                    self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
+            case "resume":
+                if self.paused:
+                    self._go(offset_ns, self._cursor_ns)
+            case "step":
+                self._step(offset_ns, int(action.values[0]) if action.values else 1)
+            case "speed":
+                self._playback = Playback(
+                    max(offset_ns, self._here_ns()) if self._playback.running else offset_ns,
+                    self._cursor_ns,
+                    Fraction(action.values[0]),
+                    self._playback.running,
+                )
+            case "seek":
+                self.seek(offset_ns, int(action.values[0]))
+            case "loop":
+                self.between_ns = (int(action.values[0]), int(action.values[1])) if action.values else None
+                if self.between_ns is not None and not self.between_ns[0] <= self.position_ns < self.between_ns[1]:
+                    self.seek(offset_ns, self.between_ns[0])
+
+    def seek(self, offset_ns: int, position_ns: int) -> None:
+        """Go to a position, in the present round; a paused player stays paused."""
+        running = self._playback.running
+        self.ended = False
+        position_ns = min(max(position_ns, 0), self._reel.length_ns)
+        self._go(offset_ns, self._round_start(self._loop) + position_ns)
+        if not running:
+            self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
+
+    def _step(self, offset_ns: int, count: int) -> None:
+        position = self.cast.next_position(self.position_ns)
+        if position is None or self.ended:
+            return
+        self._cursor_ns = self._round_start(self._loop) + position
+        rate = max((self._rate(edition) for edition in range(len(self._reel.editions))), default=Fraction(0)) or 1
+        self._stop_ns = self._cursor_ns + max(1, int(Fraction(NS) / rate * count - NS / rate / 2))
+        self._playback = Playback(offset_ns, self._cursor_ns, self.speed)
+        if self.policy is StampPolicy.SHIFT:
+            behind_ns = self.start_utc_ns + offset_ns - self._recorded_due_ns()
+            self._shift_ns = behind_ns // NS * NS
+
+    def _go(self, offset_ns: int, stream_ns: int) -> None:
+        """Go on at ``stream_ns``, from ``offset_ns`` or as soon after it as the stamps allow."""
+        self._cursor_ns = stream_ns
+        at_ns = self._aligned(self.start_utc_ns + offset_ns) - self.start_utc_ns
+        self._playback = Playback(at_ns, stream_ns, self.speed)
+
+    def _aligned(self, utc_ns: int) -> int:
+        """The first UTC time from ``utc_ns`` on at which what is at the cursor may be sent."""
+        if self.policy is StampPolicy.SHIFT:
+            due_ns = self._recorded_due_ns()
+            self._shift_ns = -((due_ns - utc_ns) // NS) * NS
+            return due_ns + self._shift_ns
+        if self.policy is StampPolicy.NOW_GRID and (rate := self._rate(int(self._reel.rows.edition[0]))):
+            index = -(-utc_ns * rate.numerator // (rate.denominator * NS))
+            return timebase.slot_time_ns(index, rate)
+        return utc_ns
+
+    def _recorded_due_ns(self) -> int:
+        """When what is at the cursor was due by its recorded stamps, this round's seconds added."""
+        reel, position_ns = self._reel, self.position_ns
+        row = min(int(np.searchsorted(reel.rows.due_ns, reel.first_due_ns + position_ns)), len(reel.rows) - 1)
+        stamp_ns = int(shifted(reel.rows.stamp_ns[row : row + 1], reel, self._loop, 0)[0])
+        due_ns = int(reel.rows.due_ns[row])
+        latency_ns = 0 if reel.spaced else due_ns - int(reel.rows.stamp_ns[row])
+        return stamp_ns + latency_ns - (due_ns - reel.first_due_ns - position_ns)
+
+    # --- faults, live
+
+    def fault(self, action: Action) -> list[int]:
+        """Do a stream's verb, from the next planned frame on; gives the parts that it concerns."""
+        return self._route.act(action)
 
 
-def _staged(script: Script, items: Items, line: Timeline, loops: int) -> Iterator[_Staged]:
-    order = count()
-    for loop in range(loops) if loops else count():
-        for cue in cues(script, items()):
-            yield _Staged(line.stream_ns(cue, loop), next(order), cue, loop)
+# --- through the pipelines ------------------------------------------------------------------------------------------
 
-
-def _in_order(staged: Iterable[_Staged], script: Script, loops: int) -> Iterator[_Staged]:
-    """Streams that run through the source at different paces, merged: each stream's own frames come in order."""
-    left = [stream.frames * loops or -1 for stream in script.streams]
-    here = [0] * len(left)
-    missing = len(left)
-    waiting: list[_Staged] = []
-    for frame in staged:
-        stream = frame.cue.stream
-        left[stream] -= 1
-        missing -= here[stream] == 0
-        here[stream] += 1
-        heapq.heappush(waiting, frame)
-        while waiting and (not missing or len(waiting) > SKEW_FRAMES):
-            first = heapq.heappop(waiting)
-            here[first.cue.stream] -= 1
-            missing += here[first.cue.stream] == 0 and left[first.cue.stream] != 0
-            yield first
-    while waiting:
-        yield heapq.heappop(waiting)
+_CLEAR, _DELAYED, _BUSY = range(3)
 
 
 class _Route:
     """Every stream's way through its pipeline; what is held back there keeps its origin here."""
 
-    def __init__(self, script: Script, line: Timeline, pipelines: Sequence[Pipeline]) -> None:
-        self._script, self._line, self._pipelines = script, line, pipelines
-        self._order = count()
+    def __init__(self, cast: Cast, pipelines: Sequence[Pipeline], *, marks: bool) -> None:
+        self._cast, self._pipelines, self._marks = cast, pipelines, marks
         self._origins: list[dict[int, _Origin]] = [{} for _ in pipelines]
-        self._configs = [stream.config for stream in script.streams]
+        self._edition = cast.first_editions()
+        self._mode = np.array([_mode(pipeline) for pipeline in pipelines], np.int8)
 
-    def through(self, staged: _Staged, offset_ns: int) -> Iterator[Due]:
-        cue, loop = staged.cue, staged.loop
-        stream = cue.stream
-        pipeline, origins = self._pipelines[stream], self._origins[stream]
-        if cue.config is not self._configs[stream]:
-            if cue.config != self._configs[stream]:
-                pipeline.configure(self._line.config(cue.config))
-            self._configs[stream] = cue.config
-        data, stamp_ns = self._line.stamped(cue, loop, offset_ns)
-        index = cue.number + loop * self._script.streams[stream].total
-        origins[index] = _Origin(cue.stamp_ns, stamp_ns, cue.config)
-        yield from self._dues(stream, pipeline.apply(index, data, offset_ns, staged.stream_ns))
-        if not pipeline.holding:
-            origins.clear()
+    def act(self, action: Action) -> list[int]:
+        concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
+        for part in concerned:
+            self._mode[part] = _mode(self._pipelines[part])
+        return concerned
 
-    def end(self) -> Iterator[Due]:
-        for stream, pipeline in enumerate(self._pipelines):
-            yield from self._dues(stream, pipeline.close())
+    def through(
+        self,
+        rows: I64,
+        parts: npt.NDArray[np.int32],
+        index: I64,
+        offsets: I64,
+        stream_ns: I64,
+        stamps: I64,
+        dressed: Dressed,
+    ) -> Sheet:
+        """What becomes of frames (N,) given in the order in which they are due."""
+        reel = self._cast.reel
+        editions, sources = reel.rows.edition[rows], reel.rows.source_ns[rows]
+        sheet = clean(offsets, parts, index, sources, stamps, editions, dressed.at, dressed.nbytes, dressed.wire)
+        if not self._mode.any() and np.array_equal(self._edition[parts], editions):
+            return sheet
+        pieces, first = [], 0
+        for row in self._changes(parts, editions):
+            pieces.append(self._faulty(sheet.take(slice(first, row)), stream_ns[first:row]))
+            first = row
+            self._configure(int(parts[row]), int(editions[row]))
+        pieces.append(self._faulty(sheet.take(slice(first, None)), stream_ns[first:]))
+        return joined(pieces)
 
-    def _dues(self, stream: int, rows: Iterable[Outgoing]) -> Iterator[Due]:
-        origins = self._origins[stream]
-        for out in rows:
-            yield Due(out.offset_ns, next(self._order), stream, out, *origins[out.index])
-            if out.fate is Fate.DISABLED:  # it was held at most once, and will not come again
-                del origins[out.index]
+    def _changes(self, parts: npt.NDArray[np.int32], editions: npt.NDArray[np.int32]) -> list[int]:
+        """The rows before which a stream's configuration changes."""
+        now, changes = self._edition.copy(), []
+        for row in np.flatnonzero(now[parts] != editions) if len(np.unique(parts)) == len(parts) else range(len(parts)):
+            if now[parts[row]] != editions[row]:
+                now[parts[row]] = editions[row]
+                changes.append(int(row))
+        return changes
+
+    def _configure(self, part: int, edition: int) -> None:
+        self._edition[part] = edition
+        self._pipelines[part].configure(self._cast.config(part, edition))
+        self._mode[part] = _mode(self._pipelines[part])
+
+    def _faulty(self, sheet: Sheet, stream_ns: I64) -> Sheet:
+        modes = self._mode[sheet.part]
+        if not modes.any():
+            return sheet
+        delayed = np.flatnonzero(modes == _DELAYED)
+        if len(delayed):
+            sheet = self._delay(sheet, delayed)
+        busy = np.flatnonzero(modes == _BUSY)
+        if not len(busy):
+            return sheet
+        return joined([sheet.take(modes != _BUSY), self._apply(sheet, busy, stream_ns)])
+
+    def _delay(self, sheet: Sheet, rows: npt.NDArray[np.int64]) -> Sheet:
+        """With the delays of frames whose index alone decides them."""
+        offsets, faults = sheet.offset_ns.copy(), sheet.faults.copy()
+        parts = sheet.part[rows]
+        for part in np.unique(parts):
+            own = rows[parts == part]
+            delays = self._pipelines[part].delays_ns(sheet.index[own])
+            assert delays is not None
+            offsets[own] += delays
+            if self._marks:
+                faults[own] = [f"delay:{delay / 1e6:.6g}ms" if delay else "" for delay in delays.tolist()]
+        return replace(sheet, offset_ns=offsets, faults=faults)
+
+    def _apply(self, sheet: Sheet, rows: npt.NDArray[np.int64], stream_ns: I64) -> Sheet:
+        """Frames that go through their pipelines one by one."""
+        out: list[tuple[int, Outgoing, _Origin]] = []
+        for row in rows.tolist():
+            part = int(sheet.part[row])
+            pipeline, origins, index = self._pipelines[part], self._origins[part], int(sheet.index[row])
+            source_ns = int(sheet.source_ns[row])
+            origins[index] = _Origin(source_ns, int(sheet.stamp_ns[row]), int(sheet.edition[row]))
+            done = pipeline.apply(
+                index, sheet.frame(row), int(sheet.offset_ns[row]), int(stream_ns[row]), stamp_ns=source_ns
+            )
+            self._take(part, done, out)
+            if not pipeline.holding:
+                origins.clear()
+                self._mode[part] = _mode(pipeline)
+        return self._sheet(out)
+
+    def _take(self, part: int, done: Sequence[Outgoing], out: list[tuple[int, Outgoing, _Origin]]) -> None:
+        origins = self._origins[part]
+        for copy in done:
+            out.append((part, copy, origins[copy.index]))
+            if copy.fate is Fate.DISABLED:  # it was held at most once, and will not come again
+                del origins[copy.index]
+
+    def end(self) -> Sheet:
+        """What the pipelines still hold back."""
+        out: list[tuple[int, Outgoing, _Origin]] = []
+        for part, pipeline in enumerate(self._pipelines):
+            if self._mode[part] == _BUSY:
+                self._take(part, pipeline.close(), out)
+        return self._sheet(out)
+
+    def _sheet(self, out: Sequence[tuple[int, Outgoing, _Origin]]) -> Sheet:
+        if not out:
+            return EMPTY
+        nbytes = np.array([len(copy.data) for _, copy, _ in out], np.int64)
+        faults, extra = np.empty(len(out), np.object_), np.empty(len(out), np.object_)
+        for row, (_, copy, _) in enumerate(out):
+            faults[row] = copy.faults if self._marks else ""
+            extra[row] = _extra(copy)
+        return Sheet(
+            np.array([copy.offset_ns for _, copy, _ in out], np.int64),
+            np.array([part for part, _, _ in out], np.int32),
+            np.array([copy.index for _, copy, _ in out], np.int64),
+            np.array([copy.copy for _, copy, _ in out], np.int32),
+            np.array([origin.source_ns for *_, origin in out], np.int64),
+            np.array([origin.stamp_ns for *_, origin in out], np.int64),
+            np.array([_FATE_CODES[copy.fate] for _, copy, _ in out], np.uint8),
+            np.array([self._cast.edition_of(part, copy.config, o.edition) for part, copy, o in out], np.int32),
+            faults,
+            extra,
+            np.cumsum(nbytes) - nbytes,
+            nbytes,
+            np.frombuffer(b"".join(copy.data for _, copy, _ in out), np.uint8),
+        )
+
+
+def _extra(copy: Outgoing) -> Extra | None:
+    extra = Extra(copy.write, copy.hangup, copy.notice)
+    return None if extra == _ORDINARY else extra
+
+
+_ORDINARY = Extra()
+
+
+def _mode(pipeline: Pipeline) -> int:
+    if pipeline.clear:
+        return _CLEAR
+    return _BUSY if pipeline.delays_ns(np.zeros(0, np.int64)) is None else _DELAYED

@@ -1,38 +1,43 @@
-"""Sending a plan on time: one loop, absolute deadlines, the ledger."""
+"""The player: a plan sent on time by one loop, told what to do by its clients, its operator and its timeline."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from types import TracebackType
 from typing import Any
 
-from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.session import Outcome, Served, served
-from pmutools.clock import Clock, utc_offset
+from pmutools.clock import Clock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError
-from pmutools.impair.outgoing import Fate, LedgerRow
 from pmutools.impair.pipeline import Pipeline
-from pmutools.impair.profile import Profile
+from pmutools.impair.profile import STREAM_VERBS, Action, Profile
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.net.server import Senders
-from pmutools.pacing import Lateness
+from pmutools.pacing import LatenessSummary
 from pmutools.timebase import NS
+from pmutools.tools.player.cast import Cast
+from pmutools.tools.player.delivery import Delivery
 from pmutools.tools.player.ledger import LedgerWriter
-from pmutools.tools.player.plan import Due, Items, plan
-from pmutools.tools.player.script import Script
-from pmutools.tools.player.stamps import StampPolicy, Timeline, timeline
+from pmutools.tools.player.plan import Plan
+from pmutools.tools.player.results import Results
+from pmutools.tools.player.stamps import StampPolicy
+from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState, StreamStatus
 
-TOGETHER_NS = 50_000
-"""Frames due within this time of each other leave with one system call."""
-TOGETHER_FRAMES = 1024
 DRAIN_NS = 2 * NS
 """How long clients may take for the last frames of a TCP stream."""
 POLL_NS = NS // 10
 """How often a waiting player looks whether it is to stop."""
+LEAD_NS = 2_000_000
+"""How long before its first frame is due a sheet is made."""
+SHEET_NS = 10_000_000
+SHEET_FRAMES = 512
+"""A sheet is as long as about so many frames take, and at most SHEET_NS: making one holds up those that are due, and
+what an operator changes begins with the next."""
+UTC_CHECK_NS = NS
 
 
 @dataclass(frozen=True)
@@ -43,10 +48,10 @@ class Options:
     listen: Sequence[Endpoint] = ()
     policy: StampPolicy = StampPolicy.SHIFT
     speed: Fraction = Fraction(1)
-    interval_ns: int | None = None
-    fps: int | None = None
     loops: int = 1
     """0: for ever."""
+    begin_utc_ns: int | None = None
+    """Not before this UTC time."""
     cfg_period_ns: int = 60 * NS
     """0: announced at the start only."""
     profile: Profile = field(default_factory=Profile)
@@ -54,60 +59,53 @@ class Options:
     duration_ns: int | None = None
 
 
-@dataclass
-class StreamResult:
-    """What became of one stream's frames, and how late they left (ns)."""
-
-    name: str
-    idcode: int
-    lateness: Lateness
-    fates: Counter[str] = field(default_factory=Counter)
-
-    def to_json(self) -> dict[str, Any]:
-        late = self.lateness.summary()
-        return {
-            "name": self.name,
-            "idcode": self.idcode,
-            "fates": dict(self.fates),
-            "late_us": {"p50": late.p50_ns / 1e3, "p99": late.p99_ns / 1e3, "max": late.max_ns / 1e3},
-            "misses": late.misses,
-        }
-
-
 class Player:
-    """One run of a script. Sockets are open once this is made; :attr:`results` are up to date at any time.
+    """One run of a cast. Sockets are open once this is made; :attr:`results` are up to date at any time.
 
-    ``stop`` is asked at least every 0.1 s whether to end early, ``tell`` is given the news of clients. ``senders`` is
-    for tests. Raises SourceError where an endpoint cannot be opened, SettingsError for one that cannot be.
+    ``stop`` is asked at least every 0.1 s whether to end early, ``tell`` is given the news of clients, ``warn`` what a
+    person should know. ``senders`` is for tests. Raises SourceError where an endpoint cannot be opened, SettingsError
+    for one that cannot be.
     """
 
     def __init__(
         self,
-        script: Script,
-        items: Items,
+        cast: Cast,
         options: Options,
         clock: Clock,
         *,
         stop: Callable[[], bool] = lambda: False,
         tell: Callable[[ServerEvent], None] = lambda event: None,
+        warn: Callable[[str], None] = lambda text: None,
+        stamp_departures: bool = False,
         senders: Senders | None = None,
     ) -> None:
-        self.script, self.items, self.options, self.clock = script, items, options, clock
-        self._stop, self._tell = stop, tell
-        self._idle = timeline(script, options.policy, 0, fps=options.fps)
-        self._announced = [self._idle.config(stream.config) for stream in script.streams]
-        self._sent = [stream.config for stream in script.streams]
-        self.results = [
-            StreamResult(stream.name, stream.config.idcode, Lateness(_half_period(config)))
-            for stream, config in zip(script.streams, self._announced, strict=True)
-        ]
+        self.cast, self.options, self.clock = cast, options, clock
+        self._stop, self._tell, self._warn = stop, tell, warn
+        self._editions = cast.first_editions()
+        configs = [cast.config(part, int(edition)) for part, edition in enumerate(self._editions)]
+        names = [part.name for part in cast.parts]
+        self.results = Results(names, configs)
         self.pipelines = [
-            Pipeline(options.profile, stream.name, options.seed, config=config, aliases=stream.names[1:])
-            for stream, config in zip(script.streams, self._announced, strict=True)
+            Pipeline(
+                options.profile,
+                part.name,
+                options.seed,
+                config=config,
+                aliases=part.aliases,
+                stations=[station.name for station in config.stations],
+            )
+            for part, config in zip(cast.parts, configs, strict=True)
         ]
-        self.senders = senders or Senders(clock, cfg_period_ns=options.cfg_period_ns or None)
+        self._state = PlayState.WAITING
+        self._plan: Plan | None = None
+        self._anchor_ns = 0
+        self._recent = deque[tuple[int, int]]()
+        self._actions = deque[Action]()
+        self.senders = senders or Senders(
+            clock, cfg_period_ns=options.cfg_period_ns or None, stamp_departures=stamp_departures
+        )
         try:
-            self.handles = [self.senders.add(_offer(config)) for config in self._announced]
+            self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(self._editions)]
             for endpoint in options.to:
                 self.senders.send_to(endpoint, self._picked(endpoint))
             for endpoint in options.listen:
@@ -118,10 +116,10 @@ class Player:
 
     def _picked(self, endpoint: Endpoint) -> list[int]:
         """Handles of the streams that an endpoint's ``idcode`` picks; all without one."""
-        streams = self.script.streams
-        chosen = [h for h, s in zip(self.handles, streams, strict=True) if endpoint.idcode in (None, s.config.idcode)]
+        parts = self.cast.parts
+        chosen = [h for h, part in zip(self.handles, parts, strict=True) if endpoint.idcode in (None, part.idcode)]
         if not chosen:
-            there = ", ".join(str(stream.config.idcode) for stream in streams)
+            there = ", ".join(str(part.idcode) for part in parts[:20]) + (" ..." if len(parts) > 20 else "")
             raise SettingsError(f"{endpoint}: no stream of IDCODE {endpoint.idcode}; there are {there}")
         return chosen
 
@@ -129,123 +127,109 @@ class Player:
         """``handles``, if commands can tell their streams apart."""
         names: dict[int, str] = {}
         for handle in handles:
-            stream = self.script.streams[handle]
-            if (other := names.setdefault(stream.config.idcode, stream.name)) != stream.name:
-                both = f"{other} and {stream.name} both have IDCODE {stream.config.idcode}"
+            part = self.cast.parts[handle]
+            if (other := names.setdefault(part.idcode, part.name)) != part.name:
+                both = f"{other} and {part.name} both have IDCODE {part.idcode}"
                 raise SettingsError(f"--listen {endpoint}: {both}; choose one with --select or --exclude")
         return handles
 
-    def play(self, ledger: LedgerWriter | None = None, progress: Callable[[int], None] = lambda sent: None) -> None:
+    # --- playing
+
+    def play(self, ledger: LedgerWriter | None = None, progress: Callable[[], None] = lambda: None) -> None:
         """Play to the end, or for ``duration_ns``. With ``listen`` only, begins at the first start command.
 
-        ``progress`` is given the number of frames sent, about once a second.
+        ``progress`` is called about once a second.
         """
         options, clock = self.options, self.clock
-        told_ns = clock.monotonic_ns()
         end_ns = None if options.duration_ns is None else clock.monotonic_ns() + options.duration_ns
         if options.listen and not options.to and not self._wait_for_start(end_ns):
             return
-        offset = utc_offset(clock)
-        line = timeline(
-            self.script,
+        utc = utc_offset(clock)
+        self._plan = plan = Plan(
+            self.cast,
             options.policy,
-            clock.realtime_ns(),
+            self.pipelines,
+            max(clock.realtime_ns(), options.begin_utc_ns or 0),
             speed=options.speed,
-            interval_ns=options.interval_ns,
-            fps=options.fps,
+            loops=options.loops,
+            timeline=options.profile.player_timeline,
+            marks=ledger is not None,
         )
-        anchor_ns = offset.monotonic_ns(line.start_utc_ns)
+        self._anchor_ns = utc.monotonic_ns(plan.start_utc_ns)
+        names = [part.name for part in self.cast.parts]
+        if ledger is not None:
+            ledger.begin(names, plan.start_utc_ns)
+        delivery = Delivery(
+            self.senders,
+            self.handles,
+            self.cast,
+            clock,
+            self.results,
+            lambda part, edition: _offer(self.cast, part, edition),
+            self._editions,
+            ledger,
+        )
+        self._state = PlayState.PLAYING
+        for action in self._actions:
+            self._do(action)
+        self._actions.clear()
         self.senders.announce()
-        dues = plan(self.script, self.items, line, self.pipelines, options.loops)
-        due = next(dues, None)
-        while due is not None:
-            due_ns = anchor_ns + due.offset_ns
-            if end_ns is not None and due_ns >= end_ns:
-                break
-            if not self._serve_until(due_ns):
-                return
-            horizon_ns = clock.monotonic_ns() - anchor_ns + TOGETHER_NS
-            batch: list[Due] = []
-            while due is not None and due.offset_ns <= horizon_ns and len(batch) < TOGETHER_FRAMES:
-                batch.append(due)
-                due = next(dues, None)
-            self._send(batch, anchor_ns, line, ledger)
-            if clock.monotonic_ns() - told_ns >= NS:
-                told_ns = clock.monotonic_ns()
-                progress(sum(result.fates[Fate.SENT] for result in self.results))
-        if end_ns is None:
+        going = self._run(plan, delivery, end_ns, self._watch(utc, progress))
+        self._state = PlayState.ENDED
+        if going and end_ns is None:
             self._drain()
-        else:  # the end was asked for in time, not in frames
+        elif going and end_ns is not None:  # the end was asked for in time, not in frames
             self._serve_until(end_ns)
 
-    def close(self) -> None:
-        self.senders.close()
+    def _run(self, plan: Plan, delivery: Delivery, end_ns: int | None, watch: Callable[[], None]) -> bool:
+        """Send the plan; false if told to stop before its end."""
+        clock = self.clock
+        last_ns = None if end_ns is None else end_ns - self._anchor_ns
+        sheet_ns = self._sheet_ns()
+        while True:
+            watch()
+            next_ns = plan.next_ns()
+            if next_ns is None:
+                if plan.ended:
+                    return True
+                next_ns = clock.monotonic_ns() - self._anchor_ns + POLL_NS  # paused
+            if last_ns is not None and next_ns >= last_ns:
+                return True
+            if self._anchor_ns + next_ns - clock.monotonic_ns() > LEAD_NS:
+                if not self._serve_until(self._anchor_ns + next_ns - LEAD_NS, once=True):
+                    return False
+                continue
+            until_ns = next_ns + sheet_ns
+            sheet = plan.until(until_ns if last_ns is None else min(until_ns, last_ns))
+            if len(sheet) and not delivery.send(sheet, self._anchor_ns, self._serve_until):
+                return False
 
-    def __enter__(self) -> Player:
-        return self
+    def _sheet_ns(self) -> int:
+        rates = [self.cast.config(part, int(edition)).rate for part, edition in enumerate(self._editions)]
+        total = sum(map(float, rates)) * float(self.options.speed)
+        return int(min(SHEET_NS, max(1_000_000, SHEET_FRAMES / total * NS))) if total else SHEET_NS
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def _watch(self, utc: UtcOffset, progress: Callable[[], None]) -> Callable[[], None]:
+        """What is to be looked at about once a second: progress, rates, and whether UTC was stepped."""
+        clock = self.clock
+        due_ns = clock.monotonic_ns()
 
-    def _send(self, batch: list[Due], anchor_ns: int, line: Timeline, ledger: LedgerWriter | None) -> None:
-        frames: list[tuple[int, bytes]] = []
-        marks: list[int | None] = []
-        for due in batch:
-            marks.append(None)
-            if due.out.fate is Fate.SENT:
-                handle = self.handles[due.stream]
-                frames += [(handle, announcement) for announcement in self._reconfigured(due)]
-                marks[-1] = len(frames)
-                frames.append((handle, due.out.data))
-        refusals = Counter(self.senders.publish(frames)) if frames else Counter[int]()
-        left_ns = self.clock.monotonic_ns() - anchor_ns
-        for due, mark in zip(batch, marks, strict=True):
-            result, fate = self.results[due.stream], due.out.fate
-            if mark is not None:
-                audience = self.senders.audience(self.handles[due.stream])
-                if refusals[mark] and refusals[mark] >= audience:
-                    fate = Fate.FAILED
-                elif not audience:
-                    fate = Fate.SKIPPED
-                else:
-                    result.lateness.add(left_ns - due.offset_ns)
-            result.fates[str(fate)] += 1
-            if ledger is not None:
-                ledger.add(self._row(due, fate, line.start_utc_ns, left_ns))
+        def watch() -> None:
+            nonlocal due_ns, utc
+            now_ns = clock.monotonic_ns()
+            if now_ns < due_ns:
+                return
+            due_ns = now_ns + UTC_CHECK_NS
+            self._recent.append((now_ns, self.results.sent))
+            while len(self._recent) > 2:
+                self._recent.popleft()
+            now = utc_offset(clock, tries=3)
+            if step_ns := utc.step_ns(now):
+                utc = now
+                self._warn(f"UTC was stepped by {step_ns / NS:+.6f} s; stamps and deadlines go on as before the step")
+            progress()
 
-    def _row(self, due: Due, fate: Fate, start_utc_ns: int, left_ns: int) -> LedgerRow:
-        return LedgerRow(
-            self.results[due.stream].name,
-            due.out.index,
-            due.out.copy,
-            due.source_ns,
-            due.stamp_ns,
-            due.offset_ns,
-            start_utc_ns + due.offset_ns,
-            start_utc_ns + left_ns if fate is Fate.SENT else None,
-            None,
-            str(fate),
-            due.out.faults,
-            len(due.out.data),
-        )
-
-    def _reconfigured(self, due: Due) -> list[bytes]:
-        """Where the recording's configuration changes: offers the new one, and gives the frames that announce it.
-
-        Everyone who gets the data gets these before them, asked for or not.
-        """
-        if due.config is self._sent[due.stream]:
-            return []
-        self._sent[due.stream] = due.config
-        config = self._idle.config(due.config)
-        if config == self._announced[due.stream]:
-            return []
-        self._announced[due.stream] = config
-        offer = _offer(config)
-        self.senders.replace(self.handles[due.stream], offer)
-        return offer.announcements(self.clock.realtime_ns())
+        return watch
 
     def _wait_for_start(self, end_ns: int | None) -> bool:
         while not self._stop() and (end_ns is None or self.clock.monotonic_ns() < end_ns):
@@ -255,12 +239,12 @@ class Player:
                     return True
         return False
 
-    def _serve_until(self, deadline_ns: int) -> bool:
-        """Answer clients until ``deadline_ns``; false if told to stop before."""
+    def _serve_until(self, deadline_ns: int, once: bool = False) -> bool:
+        """Answer clients until ``deadline_ns``, or with ``once`` until something has happened; false if told to stop."""
         while not self._stop():
             for event in self.senders.serve_until(min(deadline_ns, self.clock.monotonic_ns() + POLL_NS)):
                 self._tell(event)
-            if self.clock.monotonic_ns() >= deadline_ns:
+            if once or self.clock.monotonic_ns() >= deadline_ns:
                 return True
         return False
 
@@ -274,10 +258,98 @@ class Player:
                 return
             timeout_ns = POLL_NS
 
+    def close(self) -> None:
+        self.senders.close()
 
-def _offer(config: StreamConfig) -> Served:
+    def __enter__(self) -> Player:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- being told, and telling
+
+    def act(self, action: Action) -> None:
+        """Do what an operator says; raises SettingsError where it cannot be done.
+
+        Before the play has begun, it is done at its beginning.
+        """
+        if action.verb == "stats":
+            return
+        if self._state is PlayState.ENDED:
+            raise SettingsError("the play has ended")
+        if action.verb in STREAM_VERBS:
+            if action.rule is not None and not any(action.rule.matches(p.names) for p in self.pipelines):
+                there = ", ".join(part.name for part in self.cast.parts[:20])
+                raise SettingsError(
+                    f"{action.verb} {', '.join(action.rule.patterns)}: no such stream; there are {there}"
+                )
+        elif action.verb == "step" and not (self._plan is not None and self._plan.paused):
+            raise SettingsError("step goes on by frames from a pause; pause first")
+        if self._plan is None:
+            self._actions.append(action)
+        else:
+            self._do(action)
+
+    def _do(self, action: Action) -> None:
+        assert self._plan is not None
+        if action.verb in STREAM_VERBS:
+            self._plan.fault(action)
+        else:
+            self._plan.act(action, self.clock.monotonic_ns() - self._anchor_ns)
+
+    def status(self) -> PlayerStatus:
+        """What it is doing now."""
+        plan, reel = self._plan, self.cast.reel
+        state = PlayState.PAUSED if plan is not None and plan.paused and not plan.ended else self._state
+        between = plan.between_ns if plan is not None else None
+        elapsed_ns = self.clock.monotonic_ns() - self._anchor_ns if plan is not None else 0
+        streams = tuple(
+            StreamStatus(
+                part.name,
+                part.idcode,
+                pipeline.enabled,
+                self.senders.audience(handle),
+                self.results.fates(number),
+                _pacing(self.results.lateness.summary(number)),
+                pipeline.stages.texts(),
+            )
+            for number, (part, pipeline, handle) in enumerate(
+                zip(self.cast.parts, self.pipelines, self.handles, strict=True)
+            )
+        )
+        return PlayerStatus(
+            state,
+            plan.position_ns / NS if plan is not None else 0.0,
+            reel.length_ns / NS,
+            plan.loop if plan is not None else 0,
+            float(plan.speed if plan is not None else self.options.speed),
+            (between[0] / NS, between[1] / NS) if between is not None else None,
+            max(elapsed_ns, 0) / NS,
+            self._frames_per_s(),
+            self.results.sent,
+            _pacing(self.results.lateness.summary()),
+            streams,
+        )
+
+    def _frames_per_s(self) -> float:
+        if not self._recent:
+            return 0.0
+        then_ns, then = self._recent[0]
+        span_ns = self.clock.monotonic_ns() - then_ns
+        return (self.results.sent - then) * NS / span_ns if span_ns > 0 else 0.0
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The results of all streams."""
+        return [result.to_json() for result in self.results]
+
+
+def _offer(cast: Cast, part: int, edition: int) -> Served:
+    config = cast.config(part, edition)
     return served(config, f"pmutools player, stream {config.idcode}")
 
 
-def _half_period(config: StreamConfig) -> int:
-    return round(NS / config.rate / 2) if config.rate else NS // 2
+def _pacing(late: LatenessSummary) -> PacingStatus:
+    return PacingStatus(late.p50_ns / 1e3, late.p99_ns / 1e3, late.max_ns / 1e3, late.misses)

@@ -1,0 +1,135 @@
+"""Sheets to sockets: each copy at its time, and in its place what is not a copy: changed configurations, hang-ups."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools.c37118.session import Served
+from pmutools.clock import Clock
+from pmutools.flow import Hangup
+from pmutools.net.cargo import Frames
+from pmutools.net.server import Senders
+from pmutools.tools.player.cast import Cast
+from pmutools.tools.player.ledger import LedgerWriter
+from pmutools.tools.player.reel import I64
+from pmutools.tools.player.results import Results
+from pmutools.tools.player.sheet import FAILED, SENT, SKIPPED, Sheet
+
+TOGETHER_FRAMES = 1024
+"""Frames that leave with one system call at most."""
+
+Serve = Callable[[int], bool]
+"""Answers clients until a monotonic time; false if told to stop before."""
+
+
+class Delivery:
+    """Sends what a plan gives; ``offers`` makes what is answered and announced for a part and an edition."""
+
+    def __init__(
+        self,
+        senders: Senders,
+        handles: Sequence[int],
+        cast: Cast,
+        clock: Clock,
+        results: Results,
+        offers: Callable[[int, int], Served],
+        editions: npt.NDArray[np.int32],
+        ledger: LedgerWriter | None,
+    ) -> None:
+        self._senders, self._cast, self._clock = senders, cast, clock
+        self._handles = np.array(handles, np.int64)
+        self._results, self._offers, self._ledger = results, offers, ledger
+        self._editions = editions
+        self._hung = np.zeros(len(handles), np.bool_)
+
+    def send(self, sheet: Sheet, anchor_ns: int, serve: Serve) -> bool:
+        """Send a sheet whose offset 0 is at ``anchor_ns``; false if told to stop, with the rest left out."""
+        count = len(sheet)
+        base = self._ledger.rows if self._ledger is not None else 0
+        frames = Frames(
+            self._handles[sheet.part],
+            sheet.at,
+            sheet.nbytes,
+            sheet.wire,
+            sheet.fate == SENT,
+            base + np.arange(count),
+            [extra.write if extra is not None else None for extra in sheet.extra] if sheet.special else None,
+        )
+        cargo = self._senders.load(frames)
+        offsets, stops = sheet.offset_ns.tolist(), [*self._stops(sheet), count]
+        left_ns = np.zeros(count, np.int64)
+        counts = cargo.counts.copy()
+        refused = np.zeros(count, np.int64)
+        done, going = 0, True
+        while done < count:
+            due = bisect_right(offsets, self._clock.monotonic_ns() - anchor_ns, done)
+            if due == done:
+                going = serve(anchor_ns + offsets[done])
+                if not going:
+                    break
+                continue
+            if done == stops[0]:
+                self._turn(sheet, stops.pop(0))
+            if self._senders.stale(cargo):
+                cargo = self._senders.load(frames)
+                counts[done:] = cargo.counts[done:]
+            due = min(due, stops[0], done + TOGETHER_FRAMES)
+            for row in self._senders.send(cargo, done, due):
+                refused[row] += 1
+            left_ns[done:due] = self._clock.monotonic_ns() - anchor_ns
+            done = due
+        if done < count:
+            sheet, left_ns, counts, refused = sheet.take(slice(0, done)), left_ns[:done], counts[:done], refused[:done]
+        self._account(sheet, left_ns, counts, refused)
+        return going
+
+    def _account(self, sheet: Sheet, left_ns: I64, counts: I64, refused: I64) -> None:
+        fate = sheet.fate.copy()
+        sent = fate == SENT
+        fate[sent & (refused >= counts) & (refused > 0)] = FAILED
+        fate[sent & (counts == 0)] = SKIPPED
+        self._results.add(sheet.part, fate, left_ns - sheet.offset_ns)
+        if self._ledger is not None:
+            self._ledger.add(sheet, fate, left_ns)
+            self._ledger.stamp(*self._senders.departures())
+
+    def _stops(self, sheet: Sheet) -> list[int]:
+        """The rows before which something other than a copy is to be done."""
+        sent = sheet.fate == SENT
+        if not sheet.special and not self._hung.any() and np.array_equal(self._editions[sheet.part], sheet.edition):
+            return []
+        editions, hung, stops = self._editions.copy(), self._hung.copy(), []
+        for row in range(len(sheet)):
+            part, extra = sheet.part[row], sheet.extra[row]
+            hangs = extra is not None and extra.hangup is not Hangup.SILENCE and not hung[part]
+            returns = sent[row] and (hung[part] or editions[part] != sheet.edition[row])
+            if hangs or returns:
+                stops.append(row)
+                hung[part] = hangs
+                editions[part] = sheet.edition[row]
+        return stops
+
+    def _turn(self, sheet: Sheet, row: int) -> None:
+        """Do what is to be done before a row: hang up, come back, change the configuration."""
+        part, extra = int(sheet.part[row]), sheet.extra[row]
+        handle = int(self._handles[part])
+        if sheet.fate[row] != SENT:
+            self._hung[part] = True
+            self._senders.hang_up(handle, extra.hangup)
+            return
+        if self._hung[part]:
+            self._hung[part] = False
+            self._senders.take_up(handle)
+        edition = int(sheet.edition[row])
+        before, self._editions[part] = int(self._editions[part]), edition
+        if self._cast.config(part, before) == self._cast.config(part, edition):
+            return
+        offer = self._offers(part, edition)
+        self._senders.replace(handle, offer)
+        if extra is None or extra.notice:
+            announcements = offer.announcements(self._clock.realtime_ns())
+            self._senders.publish([(handle, frame) for frame in announcements])
