@@ -29,6 +29,20 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words) or 'none'}"
 
 
+def unique(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """``names`` with ``#2``, ``#3`` ... after those that came before, or are ``taken``."""
+    seen = set(taken)
+    out = []
+    for name in names:
+        fresh, count = name, 1
+        while fresh in seen:
+            count += 1
+            fresh = f"{name}#{count}"
+        seen.add(fresh)
+        out.append(fresh)
+    return out
+
+
 def number(low: float = -math.inf, high: float = math.inf) -> Parser[float]:
     """A parser of finite floats within ``low`` to ``high``, both allowed."""
 

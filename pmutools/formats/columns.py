@@ -28,6 +28,7 @@ from pmutools.c37118.config import Station, StreamConfig
 from pmutools.c37118.constants import INT16_FILLER, STAT_ABSENT, STAT_DATA_ERROR_MASK, Format
 from pmutools.c37118.frames import RAD_PER_COUNT
 from pmutools.c37118.layout import dtype_of, layout_of
+from pmutools.parsers import unique as unique
 
 Phasors = Literal["polar", "rect"]
 Floats = npt.NDArray[np.float64]
@@ -89,20 +90,6 @@ def _station_columns(title: str, station: Station, phasors: Phasors) -> Iterable
         yield f"{title}.{name}", name, "analog", ""
     for number in range(1, len(station.digitals) + 1):
         yield f"{title}.WORD{number}", f"WORD{number}", "digital", ""
-
-
-def unique(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """``names`` with ``#2``, ``#3`` ... after those that came before, or are ``taken``."""
-    seen = set(taken)
-    out = []
-    for name in names:
-        fresh, count = name, 1
-        while fresh in seen:
-            count += 1
-            fresh = f"{name}#{count}"
-        seen.add(fresh)
-        out.append(fresh)
-    return out
 
 
 # --- batch -> columns -------------------------------------------------------------------------------------------
