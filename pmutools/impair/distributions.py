@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -187,6 +187,40 @@ class Empirical:
         return lambda u: ranked[(u * ranked.size).astype(np.int64)]
 
 
+@dataclass(frozen=True, slots=True)
+class Histogram:
+    """Bins of three numbers each, low edge, high edge (ms), count: ``histogram(10, 12, 5,  12, 20, 80)``.
+
+    A bin is met in proportion to its count; within it every value is equally likely.
+    """
+
+    bins: tuple[float, ...] = field(metadata=parsed_by(number(), rest=True))
+
+    def __post_init__(self) -> None:
+        rows = self._rows()
+        if len(self.bins) % 3 or any(high < low or count < 0 for low, high, count in rows):
+            raise ValueError("histogram: each bin is LOW, HIGH, COUNT with LOW <= HIGH and COUNT >= 0")
+        if any(later[0] < row[1] for row, later in pairwise(rows)):
+            raise ValueError("histogram: bins must follow each other without overlap")
+        if not sum(count for _, _, count in rows) > 0:
+            raise ValueError("histogram: all bins are empty")
+
+    def _rows(self) -> list[tuple[float, float, float]]:
+        return list(zip(self.bins[::3], self.bins[1::3], self.bins[2::3], strict=False))
+
+    def quantile(self) -> Quantile:
+        lows, highs, counts = np.array([row for row in self._rows() if row[2]]).T
+        edges = np.array([0.0, *accumulate(counts.tolist())]) / math.fsum(counts.tolist())
+
+        def values(u: Array) -> Array:
+            at = np.minimum(np.searchsorted(edges, u, side="right") - 1, lows.size - 1)
+            share = np.clip((u - edges[at]) / (edges[at + 1] - edges[at]), 0.0, 1.0)
+            drawn: Array = lows[at] + (highs[at] - lows[at]) * share
+            return drawn
+
+        return values
+
+
 class QuantilePoint(NamedTuple):
     share: float
     value: float
@@ -292,6 +326,7 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
     "pareto": Pareto,
     "paretonormal": ParetoNormal,
     "empirical": Empirical,
+    "histogram": Histogram,
     "quantiles": Quantiles,
     "mixture": Mixture,
 }

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from pmutools.c37118.constants import Stat
+from pmutools.c37118.constants import LeapFlag, Stat
 from pmutools.draws import Draws
+from pmutools.impair.filler import filler
 from pmutools.impair.moment import Moment
 from pmutools.impair.scope import VALUE_FIELDS, Scope
 from pmutools.impair.wire_faults import WORD, Change, replaced_word
-from pmutools.parsers import choice, integer, number, parsed_by, suggestion
+from pmutools.parsers import Parser, choice, integer, number, parsed_by, suggestion
 from pmutools.timebase import from_ns, to_ns
 
 _WORD = struct.Struct(">H")
@@ -23,22 +25,36 @@ STAT_BITS = {
     "pmu_error": 0x4000,
     "test": 0x8000,
     "do_not_use": 0xC000,
+    "pmu_tq_unknown": 0x01C0,
+    "unlocked_10s": 0x0010,
+    "unlocked_100s": 0x0020,
+    "unlocked_1000s": 0x0030,
 }
-"""Names of STAT bits: those of :class:`~pmutools.c37118.constants.Stat` and of the data error codes."""
+"""Names of STAT bits: those of :class:`~pmutools.c37118.constants.Stat`, the data error codes, PMU_TQ 7, and how long
+the time has been unlocked (at least)."""
+LEAP_BITS = {flag.name.lower(): int(flag) for flag in LeapFlag if flag.name}
+_LEAP_MASK = 0x70
 
 
-def stat_mask(text: str) -> int:
-    """``do_not_use|0x0030``: flag names and masks."""
-    mask = 0
-    for part in text.split("|"):
-        word = part.strip().lower()
-        if word in STAT_BITS:
-            mask |= STAT_BITS[word]
-        elif word[:1].isdigit():
-            mask |= integer(0, 0xFFFF)(word)
-        else:
-            raise ValueError(f"{word!r} is no STAT flag or mask; {suggestion(word, STAT_BITS)}")
-    return mask
+def _mask(known: Mapping[str, int], most: int, what: str) -> Parser[int]:
+    """A parser of ``name|0x30``: names of ``known`` and masks up to ``most``."""
+
+    def parse(text: str) -> int:
+        mask = 0
+        for part in text.split("|"):
+            word = part.strip().lower()
+            if word in known:
+                mask |= known[word]
+            elif word[:1].isdigit():
+                mask |= integer(0, most)(word)
+            else:
+                raise ValueError(f"{word!r} is no {what} flag or mask; {suggestion(word, known)}")
+        return mask
+
+    return parse
+
+
+stat_mask = _mask(STAT_BITS, 0xFFFF, "STAT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +107,7 @@ class Quality:
 
 @dataclass(frozen=True, slots=True)
 class MovedStamp:
-    """The stamp moved by ``offset`` ms plus ``drift`` ppm of stream time (1000 ms: a missed leap second)."""
+    """The stamp moved by ``offset`` ms plus ``drift`` ppm of stream time (for leap seconds: ``leap``)."""
 
     refit: ClassVar[bool] = True
     offset: float = field(default=0.0, metadata=parsed_by(number()))
@@ -109,6 +125,36 @@ class MovedStamp:
             soc, fracsec = from_ns(moved_ns, time_base)
             _STAMP.pack_into(frame, _STAMP_AT, soc & 0xFFFF_FFFF, word & 0xFF00_0000 | fracsec)
             return f"stamp{by_ns / 1e6:+.3f}ms"
+
+        return move
+
+
+@dataclass(frozen=True, slots=True)
+class LeapError:
+    """SOC moved by whole ``seconds`` (1: an inserted leap second was missed), leap ``flags`` of the quality byte set.
+
+    The flags (``pending``, ``occurred``, ``direction_delete``, joined by ``|``) replace those sent; without ``flags``
+    these stay. So ``leap(1)`` is a clock that missed the second, ``leap(flags=pending)`` a false announcement.
+    """
+
+    refit: ClassVar[bool] = True
+    seconds: int = field(default=0, metadata=parsed_by(integer(-3600, 3600)))
+    flags: int | None = field(default=None, metadata=parsed_by(_mask(LEAP_BITS, _LEAP_MASK, "leap")))
+
+    def __post_init__(self) -> None:
+        if not self.seconds and self.flags is None:
+            raise ValueError("leap: nothing is wrong; give seconds or flags, as in leap(1) or leap(flags=pending)")
+
+    def change(self, draws: Draws, scope: Scope) -> Change:
+        seconds, flags = self.seconds, self.flags
+        shown = "" if flags is None else f"/{flags:#04x}"
+
+        def move(frame: bytearray, at: Moment, last: bytes) -> str:
+            soc, word = _STAMP.unpack_from(frame, _STAMP_AT)
+            _STAMP.pack_into(frame, _STAMP_AT, max(0, soc + seconds) & 0xFFFF_FFFF, word)
+            if flags is not None:
+                frame[_QUALITY_AT] = frame[_QUALITY_AT] & ~_LEAP_MASK | flags & _LEAP_MASK
+            return f"leap{seconds:+d}s{shown}"
 
         return move
 
@@ -157,8 +203,7 @@ class FalseValues:
                 elif what == "zero":
                     frame[start:end] = bytes(item.size)
                 elif item.name != "digitals":
-                    filler = b"\x7f\xc0\x00\x00" if "f" in item.code else b"\x80\x00"
-                    frame[start:end] = filler * (item.size // len(filler))
+                    frame[start:end] = filler(item)
             return mark
 
         return replace

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from pmutools.c37118.checksum import chk
 from pmutools.c37118.constants import CHK_SIZE
 from pmutools.draws import Draws
 from pmutools.impair.moment import Moment
@@ -109,3 +110,9 @@ def replaced_word(offset: int, value: int, name: str) -> Change:
         return f"{name}={value:#06x}"
 
     return write
+
+
+def refitted(frame: bytes, body: bytes) -> bytes:
+    """``body`` with a CHK that is right if that of ``frame`` is, and wrong if not."""
+    wrong = chk(frame[:-CHK_SIZE]) ^ int.from_bytes(frame[-CHK_SIZE:], "big")
+    return body + (chk(body) ^ wrong).to_bytes(CHK_SIZE, "big")

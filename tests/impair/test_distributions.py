@@ -78,6 +78,50 @@ def test_constant_and_discrete() -> None:
         assert abs(count / N - p) < 5 * math.sqrt(p * (1 - p) / N)
 
 
+def test_histogram_is_its_bins() -> None:
+    """Bins in proportion to their counts, uniform within; an empty bin and a gap are never met."""
+    text, bins = "histogram(10, 12, 5, 12, 14, 80, 14, 18, 0, 20, 30, 15)", ((10, 12, 5), (12, 14, 80), (20, 30, 15))
+    values = sample(text)
+    mean = sum(count * (low + high) / 2 for low, high, count in bins) / 100
+    square = sum(count * ((high - low) ** 2 / 12 + ((low + high) / 2) ** 2) for low, high, count in bins) / 100
+    sd = math.sqrt(square - mean**2)
+    assert abs(values.mean() - mean) < 5 * sd / math.sqrt(N)
+    assert abs(values.std() / sd - 1) < 5 * math.sqrt((stats.kurtosis(values, fisher=False) - 1) / (4 * N))
+    for low, high, count in bins:
+        part = values[(values >= low) & (values <= high)]
+        assert abs(part.size / N - count / 100) < DKW
+        bound = math.sqrt(math.log(2e6) / (2 * part.size))
+        assert stats.kstest(part, stats.uniform(low, high - low).cdf).statistic < bound
+    assert not ((values > 14) & (values < 20)).any()
+
+
+def test_a_histogram_of_the_histogram_gives_it_back() -> None:
+    """What the characterizer counts in bins is played back with the same counts."""
+    counts, edges = np.histogram(sample("gamma(16, 8)"), bins=40)
+    triples = [f"{low}, {high}, {count}" for low, high, count in zip(edges, edges[1:], counts, strict=False)]
+    again, _ = np.histogram(sample(f"histogram({', '.join(triples)})"), bins=edges)
+    assert np.abs(np.cumsum(again) - np.cumsum(counts)).max() / N < DKW
+
+
+@pytest.mark.parametrize("text", [text for text in CONTINUOUS if math.isfinite(CONTINUOUS[text].stats("k"))])
+def test_deviations(text: str) -> None:
+    """Standard error of a standard deviation by the theory's own fourth moment (where it has one)."""
+    theory, values = CONTINUOUS[text], sample(text)
+    kurtosis = max(float(theory.stats("k")) + 3, float(stats.kurtosis(values, fisher=False)))
+    assert abs(values.std() / theory.std() - 1) < 5 * math.sqrt((kurtosis - 1) / (4 * N))
+
+
+def test_a_pareto_with_a_cap() -> None:
+    """No mean of its own at shape 1; capped at c it has scale * (1 + ln(c/scale)), and P(cap) = scale/c."""
+    values = sample("pareto(1, 10, max=1000)")
+    mean, second = 10 * (1 + math.log(100)), 2 * 10 * 1000 - 100
+    assert abs(values.mean() - mean) < 5 * math.sqrt((second - mean**2) / N)
+    assert values.min() >= 10 and values.max() == 1000
+    assert abs(np.mean(values == 1000) - 0.01) < 5 * math.sqrt(0.01 * 0.99 / N)
+    for share in (0.1, 0.5, 0.9):
+        assert abs(np.mean(values <= 10 / (1 - share)) - share) < DKW
+
+
 def test_measured_percentiles() -> None:
     values = sample("quantiles(0% 12, 50% 16, 99% 30, 100% 44)")
     for percent, value in ((0, 12), (50, 16), (99, 30), (100, 44), (25, 14)):
@@ -123,6 +167,8 @@ WIDE = [
     "lognormal(1, 1e6)",
     "paretonormal(0, 1)",
     "empirical(1)",
+    "histogram(1, 1, 5)",
+    "histogram(-1, 2, 1e-9, 3, 4, 1)",
     "quantiles(0% 1, 100% 1)",
     "mixture(1e-9 constant(1), 0.999999999 constant(2))",
 ]
@@ -156,6 +202,10 @@ def test_every_distribution_is_tested() -> None:
         ("mixture(100% nrmal(16,2))", "mixture components: 'nrmal' is no distribution; did you mean 'normal'?"),
         ("quantiles(0% 1, 50% 3, 99% 2, 100% 9)", "quantiles: must rise from 0% to 100%, in order"),
         ("quantiles(5)", "quantiles points: '5' is not 'PERCENT% VALUE'"),
+        ("histogram(1, 2)", "histogram: each bin is LOW, HIGH, COUNT with LOW <= HIGH and COUNT >= 0"),
+        ("histogram(2, 1, 5)", "histogram: each bin is LOW, HIGH, COUNT with LOW <= HIGH and COUNT >= 0"),
+        ("histogram(1, 3, 5, 2, 4, 1)", "histogram: bins must follow each other without overlap"),
+        ("histogram(1, 2, 0)", "histogram: all bins are empty"),
         ("normal(16, 2, min=5, max=4)", "normal: min 5 is above max 4"),
         ("normal(16, 2, max=x)", "'x' is not a number"),
     ],
