@@ -4,7 +4,8 @@ A :class:`Profile` says who suffers what; a :class:`Pipeline` is one stream's wa
 each is due, :class:`Outgoing` copies out, with the time each leaves and what was done to it. Pure: no clock, no I/O.
 """
 
-from pmutools.impair.outgoing import UNREPEATABLE, Fate, LedgerRow, Outgoing, ledger_row
+from pmutools.impair.gate import Switch
+from pmutools.impair.outgoing import UNREPEATABLE, Fate, LedgerRow, Outgoing
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import (
     Action,
@@ -16,6 +17,7 @@ from pmutools.impair.profile import (
 )
 from pmutools.impair.profiles import READY, load_profile, ready_profile
 from pmutools.impair.stages import OPTIONS
+from pmutools.impair.verbs import Place
 
 __all__ = [
     "OPTIONS",
@@ -26,8 +28,9 @@ __all__ = [
     "LedgerRow",
     "Outgoing",
     "Pipeline",
+    "Place",
     "Profile",
-    "ledger_row",
+    "Switch",
     "load_profile",
     "parse_action",
     "parse_profile",

@@ -15,10 +15,18 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import CHK_SIZE, MIN_FRAME_SIZE, FrameType
 from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.moment import Moment
+from pmutools.impair.moment import Moment, Test
 from pmutools.impair.scope import FIELDS, STATION_FIELDS, WHOLE, Scope, Span, byte_span
-from pmutools.impair.selectors import DATA, Selector, Test, selector
-from pmutools.impair.source_faults import FalseValues, MovedStamp, Quality, RepeatedStamp, StatBits, WrongIdcode
+from pmutools.impair.selectors import DATA, Selector, selector
+from pmutools.impair.source_faults import (
+    FalseValues,
+    LeapError,
+    MovedStamp,
+    Quality,
+    RepeatedStamp,
+    StatBits,
+    WrongIdcode,
+)
 from pmutools.impair.wire_faults import Bits, Change, Truncate, WrongChk, WrongSize, WrongSync
 from pmutools.parsers import choice, one_of, parsed_by, probability
 
@@ -43,6 +51,7 @@ KINDS: dict[str, type[Kind]] = {
     "stat": StatBits,
     "quality": Quality,
     "stamp": MovedStamp,
+    "leap": LeapError,
     "repeat": RepeatedStamp,
     "value": FalseValues,
 }

@@ -14,12 +14,14 @@ import math
 from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pmutools.draws import Draws
-from pmutools.impair.blocks import Lanes
+from pmutools.impair.blocks import Lanes, by_index
 from pmutools.impair.distributions import (
     DISTRIBUTIONS,
     Constant,
@@ -40,6 +42,7 @@ _LONGEST_MS = 1e12
 """About 31 years, so that sums of heavy tails stay within 64 bits of ns."""
 _NUMBER = parsed_by(number())
 _POSITIVE = parsed_by(number(1e-6))
+DAY_NS = 86_400 * NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,7 @@ class Trace:
 class Step:
     """``before`` until ``time`` (s), ``after`` from then on."""
 
+    utc: ClassVar[bool] = False
     time: float = field(metadata=_NUMBER)
     before: float = field(metadata=_NUMBER)
     after: float = field(metadata=_NUMBER)
@@ -66,6 +70,7 @@ class Step:
 class Ramp:
     """From ``before`` at ``start`` (s) in a straight line to ``after`` at ``end`` (s); level outside."""
 
+    utc: ClassVar[bool] = False
     start: float = field(metadata=_NUMBER)
     end: float = field(metadata=_NUMBER)
     before: float = field(metadata=_NUMBER)
@@ -84,6 +89,7 @@ class Ramp:
 class Sinusoid:
     """``mean`` + ``amplitude`` * sin(2π t/``period`` + ``phase``): period in s, phase in degrees (a day: 86400)."""
 
+    utc: ClassVar[bool] = False
     mean: float = field(metadata=_NUMBER)
     amplitude: float = field(metadata=_NUMBER)
     period: float = field(metadata=_POSITIVE)
@@ -93,9 +99,26 @@ class Sinusoid:
         return self.mean + self.amplitude * math.sin(math.tau * time_s / self.period + math.radians(self.phase))
 
 
-Course = Step | Ramp | Sinusoid
+@dataclass(frozen=True, slots=True)
+class Diurnal:
+    """``mean`` + ``amplitude`` * cos(2π (h - ``peak``)/24), h the UTC hour of the recorded stamp: busiest at ``peak``.
+
+    By stream time, from midnight, where the stream's configuration is not known.
+    """
+
+    utc: ClassVar[bool] = True
+    mean: float = field(metadata=_NUMBER)
+    amplitude: float = field(metadata=_NUMBER)
+    peak: float = field(default=18.0, metadata=parsed_by(number(0, 24)))
+
+    def at(self, time_s: float) -> float:
+        """The delay in ms at a time of day in s (whole days do not count)."""
+        return self.mean + self.amplitude * math.cos(math.tau * (time_s / 3600 - self.peak) / 24)
+
+
+Course = Step | Ramp | Sinusoid | Diurnal
 Term = Distribution | Trace | Course
-COURSES: Mapping[str, type[Course]] = {"step": Step, "ramp": Ramp, "sinusoid": Sinusoid}
+COURSES: Mapping[str, type[Course]] = {"step": Step, "ramp": Ramp, "sinusoid": Sinusoid, "diurnal": Diurnal}
 
 
 def delay_terms(text: str) -> tuple[Term, ...]:
@@ -133,27 +156,46 @@ class Delay:
         return DelaySource(self, draws)
 
 
+class ByIndex(NamedTuple):
+    """Delays in ns of data frames by their index alone: of one, and of an array (N,)."""
+
+    one: Callable[[int], int]
+    many: Callable[[npt.NDArray[np.int64]], npt.NDArray[np.int64]]
+
+
+def fixed(delay_ns: int) -> ByIndex:
+    """The same for every frame."""
+    return ByIndex(lambda index: delay_ns, lambda index: np.full(index.size, delay_ns, np.int64))
+
+
 class DelaySource:
     """The delay of a frame in ns, before the sum of all parts is held at 0.
 
-    ``indexed`` does the same by the index of a data frame alone; None where stream time has a say.
+    ``indexed`` does the same by the index of a data frame alone; None where the time has a say.
     """
 
     def __init__(self, part: Delay, draws: Draws) -> None:
         fixed_ns = sum(round(term.value * _MS) for term in part.terms if isinstance(term, Constant))
         self._courses = [term for term in part.terms if isinstance(term, Course)]
-        by_index = {variate: term for variate, term in enumerate(part.terms) if not isinstance(term, Constant | Course)}
-        self._terms = Lanes(lambda lane: DrawnTerms(by_index, draws, lane, fixed_ns, part.corr), draws)
-        self._fixed_ns = None if by_index else fixed_ns
-        self.indexed: Callable[[int], int] | None = None
+        drawn = {variate: term for variate, term in enumerate(part.terms) if not isinstance(term, Constant | Course)}
+        self._terms = Lanes(lambda lane: DrawnTerms(drawn, draws, lane, fixed_ns, part.corr), draws)
+        self._fixed_ns = None if drawn else fixed_ns
+        self.indexed: ByIndex | None = None
         if not self._courses:
-            self.indexed = self._terms.data.__getitem__ if by_index else lambda index: fixed_ns
+            blocks = self._terms.data
+            self.indexed = ByIndex(blocks.__getitem__, partial(by_index, blocks)) if drawn else fixed(fixed_ns)
 
     def __call__(self, at: Moment) -> int:
         delay_ns = self._terms(at) if self._fixed_ns is None else self._fixed_ns
         if self._courses:
-            delay_ns += round(sum(course.at(at.time_ns / NS) for course in self._courses) * _MS)
+            delay_ns += round(sum(course.at(_clock(course, at) / NS) for course in self._courses) * _MS)
         return delay_ns
+
+
+def _clock(course: Course, at: Moment) -> int:
+    """The time that a course goes by, in ns."""
+    stamp_ns = at.stamp_ns if course.utc else None
+    return at.time_ns if stamp_ns is None else stamp_ns % DAY_NS
 
 
 class DrawnTerms:

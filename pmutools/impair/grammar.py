@@ -18,7 +18,7 @@ from pmutools.parsers import Call, bind
 
 T = TypeVar("T")
 
-_KEY = re.compile(r"(?:^|(?<=\s))([a-z_]+)=")
+_KEY = re.compile(r"(?:^|(?<=\s))([a-z_]+)=(?!=)")
 
 
 def phrase(text: str) -> Call:

@@ -13,9 +13,9 @@ from pmutools.draws import Draws
 from pmutools.impair.blocks import Blocks
 from pmutools.impair.delays import DrawnTerms
 from pmutools.impair.distributions import Distribution, distribution
-from pmutools.impair.moment import Moment
+from pmutools.impair.moment import Moment, Test
 from pmutools.impair.outgoing import Fate, Outgoing
-from pmutools.impair.selectors import ANY, Selector, Test, selector_of_any
+from pmutools.impair.selectors import ANY, Selector, selector_of_any
 from pmutools.parsers import integer, parsed_by
 from pmutools.timebase import NS
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
+from pmutools.c37118.config import StreamConfig
+from pmutools.flow import Hangup, Segmentation
+
 
 class Fate(StrEnum):
     """What became of a copy of a frame."""
@@ -25,6 +28,9 @@ class Outgoing(NamedTuple):
     """One copy of a frame after the pipeline. ``offset_ns`` counts from the start of play, all delays included.
 
     ``copy`` is 0 for the frame itself, 1, 2... for duplicates; ``delay_ns`` is what the delay stage added.
+    ``config`` is the configuration that ``data`` follows (None: the source's own) and ``notice`` whether one that
+    differs from the frame's before is sent unasked. ``write`` is for byte streams: how the frame is written (None:
+    whole, at once); ``hangup``, of a disabled frame, what TCP clients see of the silence.
     """
 
     index: int  # type: ignore[assignment]  # not tuple.index
@@ -34,10 +40,10 @@ class Outgoing(NamedTuple):
     fate: Fate = Fate.SENT
     delay_ns: int = 0
     marks: tuple[str, ...] = ()
-    config: object = None
-    write: object = None
-    hangup: object = __import__("pmutools.flow").flow.Hangup.SILENCE
+    config: StreamConfig | None = None
     notice: bool = True
+    write: Segmentation | None = None
+    hangup: Hangup = Hangup.SILENCE
 
     @property
     def faults(self) -> str:
@@ -68,31 +74,3 @@ class LedgerRow(NamedTuple):
 
 UNREPEATABLE = frozenset(("time_ns", "scheduled_ns", "sent_ns", "tx_stamp_ns"))
 """The columns that depend on when a run took place; one source, profile and seed repeat all others."""
-
-
-def ledger_row(
-    stream: str,
-    outgoing: Outgoing,
-    *,
-    source_time_ns: int,
-    time_ns: int,
-    scheduled_ns: int,
-    sent_ns: int | None = None,
-    tx_stamp_ns: int | None = None,
-    fate: Fate | None = None,
-) -> LedgerRow:
-    """The row of a copy; ``fate`` is what became of it after the pipeline, where that differs."""
-    return LedgerRow(
-        stream,
-        outgoing.index,
-        outgoing.copy,
-        source_time_ns,
-        time_ns,
-        outgoing.offset_ns,
-        scheduled_ns,
-        sent_ns,
-        tx_stamp_ns,
-        str(fate or outgoing.fate),
-        outgoing.faults,
-        len(outgoing.data),
-    )

@@ -1,28 +1,37 @@
-"""One stream's way through the faults: content, gate, drop and loss, duplicate, delay, reorder, rate and slot.
+"""One stream's way through the faults: content, configuration, gate, drop and loss, duplicate, delay, reorder, rate and
+slot, segmentation.
 
 Pure: what happens to a frame follows from the profile, the seed, the stream's name and the frame's index and time.
-Random stages are looked up by index, so a seek or a gate does not shift them; FIFO order, reordering, rate and slots
-follow the frames as they come.
+Random stages are looked up by index, so a seek or a gate does not shift them; FIFO order, reordering, rate, slots and
+``first after config`` follow the frames as they come.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.draws import Draws
 from pmutools.errors import SettingsError
+from pmutools.flow import Hangup
+from pmutools.impair.config_change import ConfigChange, Reconfiguration
 from pmutools.impair.content import Corrupt, Corruption
-from pmutools.impair.gate import HOLD_LIMIT, Gate, Verdict
+from pmutools.impair.filler import filled
+from pmutools.impair.gate import HOLD_LIMIT, Gate, Switch
 from pmutools.impair.grammar import named_parts
-from pmutools.impair.moment import CONTROL_LANE, Moment
+from pmutools.impair.moment import CONTROL_LANE, Moment, Original
 from pmutools.impair.outgoing import Fate, Outgoing
-from pmutools.impair.profile import STREAM_VERBS, Action, Profile
+from pmutools.impair.profile import STREAM_VERBS, Action, Profile, StreamRule, Treatment
 from pmutools.impair.stages import OPTIONS, Stages
-from pmutools.impair.transmission import Transmission
+from pmutools.impair.transmission import NO_DELAY, Transmission
 
 _TYPES = (*FrameType, FrameType.COMMAND, FrameType.COMMAND)
 """By bits 6-4 of SYNC; the two undefined values pass as commands."""
@@ -31,11 +40,9 @@ _TYPES = (*FrameType, FrameType.COMMAND, FrameType.COMMAND)
 class _Held(NamedTuple):
     """A frame in the gate's buffer."""
 
-    number: int
+    row: Outgoing
     at: Moment
-    data: bytes
-    offset_ns: int
-    marks: tuple[str, ...]
+    hangup: Hangup
 
 
 class Pipeline:
@@ -50,14 +57,18 @@ class Pipeline:
     seed
         Instead of the profile's; 0 where neither says.
     config
-        Needed by content faults of single fields and of the stamp.
+        Needed by whatever reads more of a frame than its type: content faults of single fields and of the stamp, a
+        change of configuration, selection by stamp or value.
     aliases
         Other names that patterns may mean: the IDCODE, ``north``, ``south``.
+    stations
+        Station names of a concentrator's stream. With more than one, a name that is none of the stream's own disables
+        and enables that station alone, for which fillers are sent; under every other option it means the stream.
 
     Raises
     ------
     SettingsError
-        A content fault that this stream's configuration cannot have.
+        What this stream's configuration cannot have: a field, a station, a value that it does not know.
     """
 
     def __init__(
@@ -68,73 +79,94 @@ class Pipeline:
         *,
         config: StreamConfig | None = None,
         aliases: Iterable[str] = (),
-        stations=(),
+        stations: Iterable[str] = (),
     ) -> None:
         self.stream = stream
-        self.names = (stream, *aliases)
+        several = tuple(stations)
+        self.stations = several if len(several) > 1 else ()
+        self.names = (stream, *(name for name in (*aliases, *several) if name not in self.stations))
         self.seed = next(value for value in (seed, profile.seed, 0) if value is not None)
         self._config = config
         self._actions = deque(action for action in profile.timeline if self._concerns(action))
         self._others = 0
         self._held = deque[_Held]()
         self._flushed: tuple[Outgoing, ...] = ()
-        self._enabled = True
+        self._switch: Switch | None = None
+        self._closed: Switch | None = None
+        self._absent = frozenset[str]()
+        self._station_gates: dict[str, Gate] = {}
+        self._fresh = True
+        self._active: tuple[bool, ...] = ()
+        self._notice = True
         self._transmission = Transmission(self._draws)
-        self._stages = Stages()
-        self._build(profile.stages(self.names), OPTIONS)
-        for action in self._actions:
-            for option, setting in action.rule.settings if action.rule else ():
-                if option == "corrupt":
-                    self._corruptions(setting.parts)
+        treatment = profile.treatment(self.names, self.stations)
+        self._check(treatment, self._actions, config)
+        self._build(treatment, OPTIONS)
 
     @property
     def stages(self) -> Stages:
         """What is in force now."""
-        return self._stages
+        return self._treatment.stages
 
     @property
     def enabled(self) -> bool:
         """The operator's switch; a scheduled ``disable`` does not move it."""
-        return self._enabled
+        return self._switch is None
+
+    @property
+    def hangup(self) -> Hangup | None:
+        """What TCP clients see of the stream's silence, by order or at the last frame given; None while it flows.
+
+        Frames kept for a burst have no rows meanwhile, so this alone tells of them.
+        """
+        silence = self._switch or self._closed
+        return None if silence is None else silence.tcp
 
     @property
     def holding(self) -> bool:
         """Whether frames are held back that will come with later ones, or at the end."""
         return bool(self._held or self._flushed or self._transmission.holding)
 
+    @property
+    def clear(self) -> bool:
+        """Whether nothing at all happens to frames, so that they may pass as they are, until the next action."""
+        return self._short_cut is NO_DELAY
+
+    def delays_ns(self, index: npt.NDArray[np.int64]) -> npt.NDArray[np.int64] | None:
+        """The delays (N,) of data frames by index (N,), where nothing but such delays happens to them.
+
+        Then :meth:`apply` would give each frame once, sent, that much later; it need not be called. None: it must be.
+        """
+        if self._short_cut is None:
+            return None
+        self._fresh = self._fresh and not index.size
+        return np.maximum(self._short_cut.many(index), 0)
+
     def act(self, action: Action) -> bool:
         """Do ``enable``, ``disable`` or ``fault`` from the next frame on; False where it does not concern this stream.
 
-        An option that is set anew starts with empty queues; its draws stay those of the frame's index.
+        An option that is set anew starts with empty queues; its draws stay those of the frame's index. Raises
+        SettingsError, and changes nothing, for what this stream cannot have.
         """
         if not self._concerns(action) or action.rule is None:
             return False
+        self._check(Treatment(), (action,), self._config)
         if action.verb == "fault":
-            for option, setting in action.rule.settings:
-                self._build(self._stages.changed(option, setting), (option,))
+            self._build(self._under(action.rule), [option for option, _ in action.rule.settings])
         else:
-            self._enabled = action.verb == "enable"
-            self._build(self._stages, ())
+            self._throw(action, action.rule)
+            self._refresh()
         return True
 
     def configure(self, config: StreamConfig) -> None:
         """From now on the stream's frames have this layout; raises SettingsError as the constructor does."""
+        self._check(self._treatment, self._actions, config)
         self._config = config
-        self._build(self._stages, ("corrupt",))
-
-    @property
-    def clear(self):
-        return self._enabled and self._short_cut is not None and self._short_cut.__name__ == "_no_delay"
-
-    def delays_ns(self, indices):
-        import numpy as np
-
-        if not self._enabled or self._short_cut is None:
-            return None
-        return np.array([max(0, self._short_cut(i)) for i in indices.tolist()], np.int64)
+        self._fresh = self._notice = True
+        self._build(self._treatment, ("corrupt", "config"))
 
     def apply(
-        self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None, stamp_ns=None
+        self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None, *, stamp_ns: int | None = None
     ) -> tuple[Outgoing, ...]:
         """What becomes of a frame; a row for each copy, also of those that will not be sent.
 
@@ -149,6 +181,8 @@ class Pipeline:
             When it is due, from the start of play.
         stream_ns
             Stream time: what it would be at speed 1; ``offset_ns`` where not given.
+        stamp_ns
+            The stamp as recorded, POSIX UTC, for selectors; where not given, the one that ``data`` carries.
 
         Returns
         -------
@@ -157,48 +191,32 @@ class Pipeline:
             the order given.
         """
         frame_type = _TYPES[data[1] >> 4 & 7]
-        if self._short_cut is not None and self._enabled:
+        if self._delay_of is not None:
             delay_ns = 0
             if frame_type is FrameType.DATA:
-                delay_ns = max(0, self._short_cut(index))
+                delay_ns = max(0, self._delay_of(index))
+                self._fresh = False
             else:
                 self._others += 1
+                self._fresh = self._fresh or frame_type.is_config
             return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns),)
         time_ns = offset_ns if stream_ns is None else stream_ns
         while self._actions and self._actions[0].at_ns <= time_ns:
             self.act(self._actions.popleft())
-        if frame_type is FrameType.DATA:
-            at = Moment(index, time_ns, frame_type)
-        else:
-            at = Moment(self._others, time_ns, frame_type, CONTROL_LANE)
-            self._others += 1
+        original = Original(data, self._config, stamp_ns)
         marks: tuple[str, ...] = ()
-        for corruption in self._corrupt:
-            data, mark = corruption.apply(data, at)
-            if mark:
-                marks = (*marks, mark)
-        flushed, self._flushed = self._flushed, ()
-        verdict = self._gate.verdict(at) if self._enabled else Verdict.CLOSED
-        if verdict is not Verdict.OPEN:
-            return (*flushed, *self._shut(verdict, _Held(index, at, data, offset_ns, marks)))
-        send = self._transmission.send
-        if not (flushed or self._held):
-            return send(index, at, data, offset_ns, marks)
-        rows = list(flushed)
-        for number, then, kept, _, past in self._held:
-            rows += send(number, then, kept, offset_ns, (*past, "burst"))
-        self._held.clear()
-        return (*rows, *send(index, at, data, offset_ns, marks))
-
-    def apply_batch(
-        self, first: int, frames: Sequence[bytes], offsets_ns: Sequence[int], stream_ns: Sequence[int] | None = None
-    ) -> list[Outgoing]:
-        """:meth:`apply` to consecutive data frames."""
-        times = offsets_ns if stream_ns is None else stream_ns
-        rows = list[Outgoing]()
-        for index, (data, offset, time) in enumerate(zip(frames, offsets_ns, times, strict=True), first):
-            rows += self.apply(index, data, offset, time)
-        return rows
+        config = None
+        if frame_type is FrameType.DATA:
+            at = Moment(index, time_ns, frame_type, 0, offset_ns, self._fresh, original)
+            self._fresh = False
+        else:
+            at = Moment(self._others, time_ns, frame_type, CONTROL_LANE, offset_ns, False, original)
+            self._others += 1
+            self._fresh = self._fresh or frame_type.is_config
+        if self._altered:
+            data, at, marks = self._spoilt(data, at)
+            config = self._reconfiguration.config(self._active)
+        return self._gated(Outgoing(index, 0, data, offset_ns, Fate.SENT, 0, marks, config, self._notice), at)
 
     def close(self) -> tuple[Outgoing, ...]:
         """The end: what is still held back; frames kept for a burst that never came were disabled."""
@@ -207,40 +225,165 @@ class Pipeline:
         self._held.clear()
         return tuple(rows)
 
-    def _shut(self, verdict: Verdict, frame: _Held) -> tuple[Outgoing, ...]:
-        if verdict is Verdict.CLOSED:
-            return (_disabled(frame),)
-        self._held.append(frame)
-        return (_disabled(self._held.popleft()),) if len(self._held) > HOLD_LIMIT else ()
+    def _spoilt(self, data: bytes, at: Moment) -> tuple[bytes, Moment, tuple[str, ...]]:
+        """A frame after fillers, content faults and the change of configuration."""
+        if at.type is not FrameType.DATA:
+            if at.type.is_config:
+                data = self._reconfiguration.announcement(data, self._active)
+            data, marks = self._corrupted(data, at)
+            return data, at, marks
+        active = self._reconfiguration.active(at)
+        if active != self._active:
+            at = at._replace(fresh=True)
+            if any(active):
+                self._notice = self._reconfiguration.notice(active)
+            self._active = active
+        absent = self._absent_stations(at)
+        if absent and self._config is not None:
+            data = filled(data, self._config, absent)
+        data, spoilt = self._corrupted(data, at)
+        data, changed = self._reconfiguration.data(data, at, active)
+        return data, at, (*(f"filler({station})" for station in absent), *spoilt, *changed)
+
+    def _corrupted(self, data: bytes, at: Moment) -> tuple[bytes, tuple[str, ...]]:
+        marks: tuple[str, ...] = ()
+        for corruption in self._corrupt:
+            data, mark = corruption.apply(data, at)
+            if mark:
+                marks = (*marks, mark)
+        return data, marks
+
+    def _absent_stations(self, at: Moment) -> tuple[str, ...]:
+        return tuple(
+            station
+            for station in self.stations
+            if station in self._absent
+            or ((gate := self._station_gates.get(station)) is not None and gate.closure(at) is not None)
+        )
+
+    def _gated(self, row: Outgoing, at: Moment) -> tuple[Outgoing, ...]:
+        """From the gate on: disabled, held, or sent after what was held."""
+        flushed, self._flushed = self._flushed, ()
+        self._closed = self._gate.closure(at)
+        silence = self._switch or self._closed
+        if silence is not None:
+            frame = _Held(row, at, silence.tcp)
+            if not silence.holds:
+                return (*flushed, _disabled(frame))
+            self._held.append(frame)
+            return (*flushed, _disabled(self._held.popleft())) if len(self._held) > HOLD_LIMIT else flushed
+        send = self._transmission.send
+        if not (flushed or self._held):
+            return send(row, at)
+        rows = list(flushed)
+        for kept, then, _ in self._held:
+            rows += send(kept._replace(offset_ns=row.offset_ns, marks=(*kept.marks, "burst")), then)
+        self._held.clear()
+        self._refresh()
+        return (*rows, *send(row, at))
+
+    def _throw(self, action: Action, rule: StreamRule) -> None:
+        """The operator's switch, of the stream or of some of its stations."""
+        whole, stations = rule.matches(self.names), rule.among(self.stations)
+        if action.verb == "enable":
+            self._switch = None if whole else self._switch
+            self._absent -= frozenset(stations)
+        elif whole:
+            self._switch = action.switch
+        else:
+            self._absent |= frozenset(stations)
 
     def _concerns(self, action: Action) -> bool:
-        return action.verb in STREAM_VERBS and action.rule is not None and action.rule.matches(self.names)
+        return action.verb in STREAM_VERBS and action.rule is not None and action.rule.matches(self._all_names)
 
-    def _build(self, stages: Stages, options: Iterable[str]) -> None:
-        """Put ``options`` of ``stages`` to work; what is at work for the other options goes on."""
+    @property
+    def _all_names(self) -> tuple[str, ...]:
+        return (*self.names, *self.stations)
+
+    def _under(self, rule: StreamRule) -> Treatment:
+        return self._treatment.under(rule, self.names, self.stations)
+
+    def _build(self, treatment: Treatment, options: Collection[str]) -> None:
+        """Put ``options`` of a treatment to work; what is at work for the other options goes on."""
+        stages = treatment.stages
         for option in options:
             if option == "corrupt":
-                self._corrupt = self._corruptions(stages.corrupt)
+                self._corrupt = self._corruptions(stages.corrupt, self._config)
+            elif option == "config":
+                self._reconfiguration = self._changes(stages.config, self._config)
+                self._fresh = self._fresh or any(self._active)
+                self._active = self._reconfiguration.none
             elif option == "disable":
-                self._gate = Gate(stages.disable, self._draws)
+                self._gate, self._closed = Gate(stages.disable, self._draws), None
+                self._station_gates = {
+                    station: Gate(parts, partial(self._station_draws, station))
+                    for station, parts in treatment.stations.items()
+                    if parts
+                }
             else:
                 self._flushed += self._transmission.change(option, stages)
-        self._stages = stages
-        busy = stages.corrupt or stages.disable or self._actions or self._flushed or self._held
-        self._short_cut = None if busy else self._transmission.delay_by_index()
+        self._treatment = treatment
+        self._refresh()
 
-    def _corruptions(self, parts: Sequence[Corrupt]) -> list[Corruption]:
-        try:
+    def _refresh(self) -> None:
+        """Whether frames change on their way, and whether a frame's index alone says what happens to it."""
+        stages = self._treatment.stages
+        self._altered = bool(stages.corrupt or stages.config or self._station_gates or self._absent)
+        gated = stages.disable or self._switch or self._actions or self._flushed or self._held
+        plain = not (self._altered or gated) and self._notice
+        self._short_cut = self._transmission.delay_by_index() if plain else None
+        self._delay_of = None if self._short_cut is None else self._short_cut.one
+
+    def _check(self, treatment: Treatment, actions: Iterable[Action], config: StreamConfig | None) -> None:
+        """Raise SettingsError for what a stream of this configuration cannot have, now or later."""
+        parts: list[tuple[str, Sequence[Any]]] = [(option, getattr(treatment.stages, option)) for option in OPTIONS]
+        parts += [("disable", silences) for silences in treatment.stations.values()]
+        for action in actions:
+            if action.rule is not None:
+                parts += [(option, setting.parts) for option, setting in action.rule.settings]
+        for option, some in parts:
+            with self._naming(option):
+                for part in some:
+                    part.when.check(config)
+            if option == "corrupt":
+                self._corruptions(some, config)
+            elif option == "config":
+                self._changes(some, config)
+        if config is None and (treatment.stations or any(map(self._means_a_station, actions))):
+            problem = "a station can only be silent alone in a stream whose configuration is known"
+            raise SettingsError(f"stream {self.stream}: disable: {problem}")
+
+    def _means_a_station(self, action: Action) -> bool:
+        """Whether an action that concerns this stream silences some of its stations alone."""
+        if action.rule is None or action.rule.matches(self.names):
+            return False
+        return action.verb == "disable" or any(option == "disable" for option, _ in action.rule.settings)
+
+    def _corruptions(self, parts: Sequence[Corrupt], config: StreamConfig | None) -> list[Corruption]:
+        with self._naming("corrupt"):
             return [
-                Corruption(part, self._draws(name), part.when.test(self._draws(f"{name}.when")), self._config)
+                Corruption(part, self._draws(name), part.when.test(self._draws(f"{name}.when")), config)
                 for name, part in named_parts("corrupt", parts)
             ]
+
+    def _changes(self, parts: Sequence[ConfigChange], config: StreamConfig | None) -> Reconfiguration:
+        with self._naming("config"):
+            return Reconfiguration(parts, self._draws, config)
+
+    @contextmanager
+    def _naming(self, option: str) -> Iterator[None]:
+        """Turns a ValueError into a SettingsError that names the stream and the option."""
+        try:
+            yield
         except ValueError as error:
-            raise SettingsError(f"stream {self.stream}: corrupt: {error}") from None
+            raise SettingsError(f"stream {self.stream}: {option}: {error}") from None
 
     def _draws(self, stage: str) -> Draws:
         return Draws(self.seed, self.stream, stage)
 
+    def _station_draws(self, station: str, stage: str) -> Draws:
+        return self._draws(f"{station}.{stage}")
+
 
 def _disabled(frame: _Held) -> Outgoing:
-    return Outgoing(frame.number, 0, frame.data, frame.offset_ns, Fate.DISABLED, 0, frame.marks)
+    return frame.row._replace(fate=Fate.DISABLED, hangup=frame.hangup)

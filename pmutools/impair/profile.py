@@ -10,22 +10,27 @@
               stat(do_not_use) when=5..8
     loss = trace(@lost.txt)   ; numbers from a file beside the profile
     [at 12.5]                 ; seconds of stream time
-    do = disable N1
+    do = disable N1 tcp=rst
          fault N2 loss=gemodel(1%, 20%)
+         pause 5              ; the player's verbs: pause S, seek T, speed X, loop A B, loop off
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from pmutools.errors import SourceError
+from pmutools.impair.gate import Disable, Switch
+from pmutools.impair.grammar import phrase
 from pmutools.impair.stages import OPTIONS, Setting, Stages, parse_setting
-from pmutools.parsers import integer, parsed_by, seconds_ns, suggestion
+from pmutools.impair.verbs import PLAYER, Values, player_values, refuse_unscheduled
+from pmutools.parsers import bind, integer, parsed_by, seconds_ns, suggestion
 from pmutools.settings import Entry, Section, Where, fill, parse_ini
 
 ReadText = Callable[[str], str]
@@ -40,20 +45,52 @@ class StreamRule(NamedTuple):
     def matches(self, names: Iterable[str]) -> bool:
         return any(fnmatchcase(name.casefold(), pattern.casefold()) for name in names for pattern in self.patterns)
 
+    def among(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of ``names`` that a pattern fits."""
+        return tuple(name for name in names if self.matches((name,)))
+
 
 class Action(NamedTuple):
-    """Something to do: ``enable``, ``disable`` and ``fault`` concern streams, all others the player."""
+    """Something to do: ``enable``, ``disable`` and ``fault`` concern streams, all others the player.
+
+    ``rule`` says whom it concerns, and for ``fault`` what is set; ``switch``, of ``disable``, how a stream is silent.
+    ``argument`` is what followed a player's verb, ``values`` the same read: see
+    :func:`~pmutools.impair.verbs.player_values`.
+    """
 
     verb: str
     rule: StreamRule | None = None
-    """Whom it concerns, and for ``fault`` what is set."""
     argument: str = ""
     at_ns: int = 0
-    values: tuple = ()
+    values: Values = ()
+    switch: Switch = Switch()
 
 
 STREAM_VERBS = ("enable", "disable", "fault")
-PLAYER_VERBS = ("pause", "resume", "step", "seek", "speed", "loop", "stats")
+PLAYER_VERBS = tuple(PLAYER)
+
+
+class Treatment(NamedTuple):
+    """What one stream goes through, and the silences of single stations in it."""
+
+    stages: Stages = Stages()
+    stations: Mapping[str, tuple[Disable, ...]] = MappingProxyType({})
+
+    def under(self, rule: StreamRule, names: Collection[str], stations: Collection[str] = ()) -> Treatment:
+        """After a rule, for a stream known by ``names`` with these ``stations``.
+
+        What a station's name addresses is done to the whole stream, but ``disable`` to that station alone.
+        """
+        stages, silences = self.stages, dict(self.stations)
+        whole, found = rule.matches(names), rule.among(stations)
+        for option, setting in rule.settings if whole or found else ():
+            if option == "disable" and not whole:
+                silences |= {station: setting.onto(silences.get(station, ())) for station in found}
+            else:
+                stages = stages.changed(option, setting)
+                if option == "disable" and not setting.adds:
+                    silences = {}
+        return Treatment(stages, silences)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,18 +106,21 @@ class Profile:
     timeline: tuple[Action, ...] = ()
     seed: int | None = None
 
+    @property
+    def player_timeline(self) -> tuple[Action, ...]:
+        """What the timeline has the player do, in order of stream time."""
+        return tuple(action for action in self.timeline if action.verb in PLAYER)
+
+    def treatment(self, names: Collection[str], stations: Collection[str] = ()) -> Treatment:
+        """What a stream goes through before the timeline changes it; arguments as of :meth:`Treatment.under`."""
+        treatment = Treatment()
+        for rule in self.rules:
+            treatment = treatment.under(rule, names, stations)
+        return treatment
+
     def stages(self, names: Iterable[str]) -> Stages:
         """What a stream known by these names goes through before the timeline changes it."""
-        names, stages = tuple(names), Stages()
-        for rule in self.rules:
-            if rule.matches(names):
-                for option, setting in rule.settings:
-                    stages = stages.changed(option, setting)
-        return stages
-
-    @property
-    def player_timeline(self):
-        return [a for a in self.timeline if a.verb not in STREAM_VERBS]
+        return self.treatment(tuple(names)).stages
 
     def then(self, other: Profile) -> Profile:
         """This profile with ``other`` (say, the command line's options) on top."""
@@ -127,16 +167,14 @@ def profile_of_options(options: Iterable[tuple[str, str]], read: ReadText | None
 
 
 def parse_action(text: str, read: ReadText | None = None) -> Action:
-    """``enable NAME``, ``disable NAME``, ``fault NAME OPTION=VALUE`` or one of the player's verbs.
+    """``enable NAME``, ``disable NAME [release=] [tcp=]``, ``fault NAME OPTION=VALUE`` or one of the player's verbs.
 
     A NAME is a pattern, in double quotes where it holds a space before an option. Raises ValueError.
     """
     verb, _, rest = text.strip().partition(" ")
     verb, rest = verb.lower(), rest.strip()
     if verb in ("enable", "disable"):
-        if not rest:
-            raise ValueError(f"{verb} whom? write '{verb} NAME'")
-        return Action(verb, StreamRule(_patterns(rest.strip('"')), ()))
+        return _switched(verb, rest)
     if verb == "fault":
         match = _FAULT.fullmatch(rest)
         if match is None:
@@ -148,10 +186,21 @@ def parse_action(text: str, read: ReadText | None = None) -> Action:
             raise ValueError(f"{option}: {error}") from None
         return Action(verb, StreamRule(_patterns(match[1] or match[2]), (setting,)))
     if verb in PLAYER_VERBS:
-        return Action(verb, argument=rest)
+        return Action(verb, argument=rest, values=player_values(verb, rest))
     raise ValueError(f"{verb!r} is nothing to do; {suggestion(verb, (*STREAM_VERBS, *PLAYER_VERBS))}")
 
 
+def _switched(verb: str, text: str) -> Action:
+    match = _SWITCH.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{verb} whom? write '{verb} NAME'")
+    if verb == "enable" and match[3]:
+        raise ValueError(f"enable takes a name alone, not {match[3].strip()}")
+    switch = bind(Switch, phrase(match[3]))
+    return Action(verb, StreamRule(_patterns(match[1] or match[2]), ()), switch=switch)
+
+
+_SWITCH = re.compile(r'(?:"([^"]+)"|([^"]+?))((?:\s+[a-z_]+=\S+)*)')
 _ADDRESSED = re.compile(r"([^@()]+?)@(.+)", re.DOTALL)
 _FAULT = re.compile(r'(?:"([^"]+)"|(\S+))\s+([A-Za-z]+)\s*=\s*(.*)', re.DOTALL)
 _FILE = re.compile(r"(?<=[(,\s])@([^\s,()]+)")
@@ -210,8 +259,8 @@ def _actions(section: Section, read: ReadText | None) -> Iterator[Action]:
 
 def _scheduled(text: str, read: ReadText | None) -> Action:
     action = parse_action(text, read)
-    if action.verb not in STREAM_VERBS:
-        raise ValueError(f"{action.verb} cannot be scheduled; a timeline can {', '.join(STREAM_VERBS)}")
+    if action.verb in PLAYER:
+        refuse_unscheduled(action.verb, action.values)
     return action
 
 

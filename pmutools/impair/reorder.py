@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.moment import Moment
+from pmutools.impair.moment import Moment, Test
 from pmutools.impair.outgoing import Outgoing
-from pmutools.impair.selectors import DATA, Selector, Test, selector
+from pmutools.impair.selectors import DATA, Selector, selector
 from pmutools.parsers import choice, integer, parsed_by, probability
 
 MAX_COPIES = 64

@@ -1,7 +1,8 @@
 """The options of a stream: which stages there are, how each is written, how later settings meet earlier ones.
 
-One line of a value is one part of a stage. ``delay`` parts add up, ``corrupt`` parts follow each other, a frame is
-lost, dropped or disabled if any part says so; the other stages have one part. A value replaces what was set before,
+One line of a value is one part of a stage. ``delay`` parts add up, ``corrupt`` and ``config`` parts follow each other,
+a frame is lost, dropped or disabled if any part says so, the first ``segment`` part that applies decides; the other
+stages have one part. A value replaces what was set before,
 ``none`` switches it off, a value that begins with ``+`` adds its parts.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+from pmutools.impair.config_change import ConfigChange
 from pmutools.impair.content import Corrupt
 from pmutools.impair.delays import Delay
 from pmutools.impair.gate import Disable
@@ -17,6 +19,7 @@ from pmutools.impair.grammar import parse_stage
 from pmutools.impair.link import Rate, Slot
 from pmutools.impair.losses import Loss
 from pmutools.impair.reorder import Duplicate, Reorder
+from pmutools.impair.segment import Segment
 from pmutools.impair.selectors import Selector, selector
 from pmutools.parsers import parsed_by
 
@@ -31,6 +34,7 @@ class Stages:
     """What one stream goes through, in this order."""
 
     corrupt: tuple[Corrupt, ...] = ()
+    config: tuple[ConfigChange, ...] = ()
     disable: tuple[Disable, ...] = ()
     drop: tuple[Drop, ...] = ()
     loss: tuple[Loss, ...] = ()
@@ -39,11 +43,11 @@ class Stages:
     reorder: tuple[Reorder, ...] = ()
     rate: tuple[Rate, ...] = ()
     slot: tuple[Slot, ...] = ()
+    segment: tuple[Segment, ...] = ()
 
     def changed(self, option: str, setting: Setting) -> Stages:
         """With one option set (or added to)."""
-        parts = (*getattr(self, option), *setting.parts) if setting.adds else setting.parts
-        return replace(self, **{option: parts})
+        return replace(self, **{option: setting.onto(getattr(self, option))})
 
 
 class Setting(NamedTuple):
@@ -52,9 +56,14 @@ class Setting(NamedTuple):
     parts: tuple[Any, ...]
     adds: bool = False
 
+    def onto(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The parts after this setting, where ``parts`` were there."""
+        return (*parts, *self.parts) if self.adds else self.parts
+
 
 OPTIONS: dict[str, type[Any]] = {
     "corrupt": Corrupt,
+    "config": ConfigChange,
     "disable": Disable,
     "drop": Drop,
     "loss": Loss,
@@ -63,8 +72,9 @@ OPTIONS: dict[str, type[Any]] = {
     "reorder": Reorder,
     "rate": Rate,
     "slot": Slot,
+    "segment": Segment,
 }
-SEVERAL = frozenset(("corrupt", "disable", "drop", "loss", "delay"))
+SEVERAL = frozenset(("corrupt", "config", "disable", "drop", "loss", "delay", "segment"))
 """Options that may have more than one part."""
 
 

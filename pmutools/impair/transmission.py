@@ -1,4 +1,4 @@
-"""From the gate to the wire: drop and loss, duplicates, delay, reordering, rate and slots."""
+"""From the gate to the wire: drop and loss, duplicates, delay, reordering, rate and slots, segmentation."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from typing import Any
 
 from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
-from pmutools.impair.delays import Delay, DelaySource
+from pmutools.impair.delays import ByIndex, Delay, DelaySource, fixed
 from pmutools.impair.grammar import named_parts
 from pmutools.impair.link import Rate, RateLink, Slot, SlotLink
 from pmutools.impair.losses import Loss, Lost
-from pmutools.impair.moment import Moment
+from pmutools.impair.moment import Moment, Test
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.reorder import Duplicate, Leaving, Reorder, Reordering
-from pmutools.impair.selectors import Selector, Test, is_data
+from pmutools.impair.segment import Segment, Segmenting
+from pmutools.impair.selectors import Selector, is_data
 from pmutools.impair.stages import Drop, Stages
 
 
@@ -35,6 +36,8 @@ class Transmission:
         self._reordering: Reordering | None = None
         self._rate: RateLink | None = None
         self._slot: SlotLink | None = None
+        self._segmenting: Segmenting | None = None
+        self._after = False
         self._setters: dict[str, Callable[[Any], None]] = {
             "drop": self._set_drop,
             "loss": self._set_loss,
@@ -43,6 +46,7 @@ class Transmission:
             "reorder": self._set_reorder,
             "rate": self._set_rate,
             "slot": self._set_slot,
+            "segment": self._set_segment,
         }
 
     @property
@@ -54,6 +58,7 @@ class Transmission:
         """Put one option anew to work; gives what its old state held back."""
         flushed = self.flush() if option == "reorder" else ()
         self._setters[option](getattr(stages, option))
+        self._after = any((self._reordering, self._rate, self._slot, self._segmenting))
         return flushed
 
     def _set_drop(self, parts: tuple[Drop, ...]) -> None:
@@ -91,16 +96,17 @@ class Transmission:
         for part in parts:
             self._slot = SlotLink(part, self._draws("slot"), self._test(part.when, "slot"))
 
-    def send(
-        self, number: int, at: Moment, data: bytes, offset_ns: int, marks: tuple[str, ...]
-    ) -> tuple[Outgoing, ...]:
-        """The rows of a frame that passed the gate, due at ``offset_ns``; ``number`` is the caller's index."""
+    def _set_segment(self, parts: tuple[Segment, ...]) -> None:
+        self._segmenting = Segmenting(parts, self._draws) if parts else None
+
+    def send(self, row: Outgoing, at: Moment) -> tuple[Outgoing, ...]:
+        """The rows of a frame that passed the gate, due at ``row.offset_ns``."""
         for drops in self._drops:
             if drops(at):
-                return (Outgoing(number, 0, data, offset_ns, Fate.DROPPED, 0, marks),)
+                return (row._replace(fate=Fate.DROPPED),)
         for lost, selected in self._losses:
             if lost(at) and selected(at):
-                return (Outgoing(number, 0, data, offset_ns, Fate.LOST, 0, marks),)
+                return (row._replace(fate=Fate.LOST),)
         extra = 0
         if self._copies is not None:
             happens, selected, count = self._copies
@@ -112,20 +118,21 @@ class Transmission:
             for source, selected in self._delays:
                 if selected(then):
                     delay_ns += source(then)
-            leaves_ns = offset_ns + max(0, delay_ns)
+            leaves_ns = row.offset_ns + max(0, delay_ns)
             if self._keep_order:
                 leaves_ns = self._last_ns = max(leaves_ns, self._last_ns)
-            row = Outgoing(number, copy, data, leaves_ns, Fate.SENT, leaves_ns - offset_ns, marks)
-            rows += self._leave(Leaving(row, then)) if self._reordering or self._rate or self._slot else (row,)
+            late_ns = leaves_ns - row.offset_ns
+            out = Outgoing(row.index, copy, row.data, leaves_ns, Fate.SENT, late_ns, row.marks, row.config, row.notice)
+            rows += self._link(self._reordered(Leaving(out, then))) if self._after else (out,)
         return rows
 
-    def delay_by_index(self) -> Callable[[int], int] | None:
-        """The delay (ns) of a data frame by its index, where nothing else happens to it and nothing else counts."""
-        others = self._drops or self._losses or self._copies or self._reordering or self._rate or self._slot
+    def delay_by_index(self) -> ByIndex | None:
+        """The delays of data frames by their index, where nothing else happens to them and nothing else counts."""
+        others = self._drops or self._losses or self._copies or self._after
         if others or self._keep_order or len(self._delays) > 1:
             return None
         if not self._delays:
-            return _no_delay
+            return NO_DELAY
         source, selected = self._delays[0]
         return source.indexed if selected is is_data else None
 
@@ -133,19 +140,21 @@ class Transmission:
         """What reordering still holds back."""
         return self._link(self._reordering.close()) if self._reordering else ()
 
-    def _leave(self, leaving: Leaving) -> tuple[Outgoing, ...]:
-        return self._link(self._reordering.apply(leaving) if self._reordering else (leaving,))
+    def _reordered(self, leaving: Leaving) -> Iterable[Leaving]:
+        return self._reordering.apply(leaving) if self._reordering else (leaving,)
 
     def _link(self, leaving: Iterable[Leaving]) -> tuple[Outgoing, ...]:
         rows = list[Outgoing]()
         for outgoing, at in leaving:
             row = self._rate.apply(outgoing, at) if self._rate else outgoing
-            rows.append(self._slot.apply(row, at) if self._slot and row.fate is Fate.SENT else row)
+            if row.fate is Fate.SENT:
+                row = self._slot.apply(row, at) if self._slot else row
+                row = self._segmenting.apply(row, at) if self._segmenting else row
+            rows.append(row)
         return tuple(rows)
 
     def _test(self, selector: Selector, stage: str) -> Test:
         return selector.test(self._draws(f"{stage}.when"))
 
 
-def _no_delay(index: int) -> int:
-    return 0
+NO_DELAY = fixed(0)
