@@ -13,6 +13,7 @@ from support.impairment import CONFIG, CONFIG_FRAME, PERIOD_NS, frame, options, 
 
 from pmutools.c37118 import decode_data, decode_prefix
 from pmutools.c37118.checksum import chk
+from pmutools.c37118.constants import LeapFlag, stat_pmu_tq, stat_unlocked_time
 from pmutools.errors import ChecksumError, SettingsError
 from pmutools.impair import Outgoing, Pipeline
 from pmutools.impair.content import KINDS
@@ -122,6 +123,9 @@ def test_stat() -> None:
     data = decode_data(row.data, CONFIG)
     assert (data.stat(0), data.stat(1)) == (0x4000, 0xC000)
     assert row.faults == "corrupt:stat+0xc000-0x0000,corrupt:stat+0x0000-0x8000"
+    (row,) = corrupted("stat(unlocked_1000s|pmu_tq_unknown|sorted_by_arrival|config_change)")
+    stat = decode_data(row.data, CONFIG).stat(1)
+    assert (stat_unlocked_time(stat), stat_pmu_tq(stat), stat & ~0x01F0) == (3, 7, 0x1400)
 
 
 def test_stamps() -> None:
@@ -133,6 +137,22 @@ def test_stamps() -> None:
     last = decode_data(rows[-1].data, CONFIG).time_ns - decode_data(frame(1199), CONFIG).time_ns
     assert abs(last - 100e-6 * 1199 * PERIOD_NS) <= 500
     assert rows[-1].faults == "corrupt:stamp+1.998ms"
+
+
+def test_leap_second_errors() -> None:
+    """SOC alone moves, by whole seconds, whatever TIME_BASE; flags replace those sent, MSG_TQ stays."""
+    (row,) = corrupted("leap(1)", first=7)
+    data = decode_data(row.data, CONFIG)
+    assert data.time_ns - decode_data(frame(7), CONFIG).time_ns == 10**9 and data.time_quality == 0
+    assert row.faults == "corrupt:leap+1s"
+    (row,) = corrupted("quality(0x7B)\nleap(-1, flags=pending|direction_delete)", first=7)
+    data = decode_data(row.data, CONFIG)
+    assert data.time_ns - decode_data(frame(7), CONFIG).time_ns == -(10**9)
+    assert data.time_quality == LeapFlag.PENDING | LeapFlag.DIRECTION_DELETE | 0x0B
+    (row,) = corrupted("quality(0x7B)\nleap(flags=0)")
+    assert decode_data(row.data, CONFIG).time_quality == 0x0B
+    (row,) = Pipeline(options("corrupt=leap(1)"), "N1").apply(0, frame(0), 0)
+    assert decode_data(row.data, CONFIG).time_ns == decode_data(frame(60), CONFIG).time_ns
 
 
 def test_repeated_stamp() -> None:
@@ -178,7 +198,13 @@ def test_frozen_values_are_those_of_the_last_good_frame() -> None:
 
 
 def test_every_kind_is_repeatable_and_leaves_the_rest_alone() -> None:
-    kinds = {"idcode": "idcode(5)", "quality": "quality(1)", "stat": "stat(1)", "value": "value(nan)"}
+    kinds = {
+        "idcode": "idcode(5)",
+        "quality": "quality(1)",
+        "stat": "stat(1)",
+        "value": "value(nan)",
+        "leap": "leap(1)",
+    }
     for kind in KINDS:
         rows, again = (corrupted(f"30% {kinds.get(kind, kind)}", 200) for _ in range(2))
         assert rows == again
@@ -222,6 +248,9 @@ def test_both_copies_carry_the_fault() -> None:
         ("1% chk=maybe", "chk: 'maybe' is not one of keep, fix"),
         ("value(wrong)", "value what: 'wrong' is not one of nan, zero, frozen"),
         ("idcode", "value is missing; write idcode(value)"),
+        ("leap", "leap: nothing is wrong; give seconds or flags, as in leap(1) or leap(flags=pending)"),
+        ("leap(flags=pendign)", "leap flags: 'pendign' is no leap flag or mask; did you mean 'pending'?"),
+        ("leap(flags=0x80)", "leap flags: 0x80 is out of range; it must be 0 to 112"),
     ],
 )
 def test_grammar_errors(text: str, message: str) -> None:

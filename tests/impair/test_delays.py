@@ -7,9 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 from support.impairment import PERIOD_NS, delays_ms, frame, options, pipeline, play
 
+from pmutools.impair import Fate, Pipeline, parse_profile
 from pmutools.impair.blocks import ANCHOR
 from pmutools.impair.stages import parse_setting
 
@@ -57,6 +60,22 @@ def test_courses_follow_stream_time() -> None:
     assert np.allclose(wave, 20 + 10 * np.cos(2 * np.pi * np.arange(120) / 60), atol=1e-5)
     both = delays("normal(100, 5) + step(0.5, 0, 10)", 60)
     assert np.allclose(both - delays("normal(100, 5)", 60), [0] * 31 + [10] * 29, atol=2e-6)
+
+
+def test_diurnal_goes_by_the_utc_hour_of_the_recorded_stamp() -> None:
+    """The same every day, highest at its peak and lowest twelve hours away, whatever the stream time."""
+    faults = pipeline("delay=diurnal(20, 8, peak=18)")
+    day_ns = 86_400 * 10**9
+    for hour, expected in ((18, 28), (6, 12), (0, 20), (12, 20), (21, 20 + 8 / math.sqrt(2))):
+        for days in (0, 17_000):
+            stamp_ns = days * day_ns + hour * 3600 * 10**9
+            (row,) = faults.apply(0, frame(0), 0, stamp_ns=stamp_ns)
+            assert row.delay_ns == round(expected * 1e6)
+    hours = np.arange(24 * 60) / 60
+    found = [faults.apply(0, frame(0), 0, stamp_ns=round(h * 3600e9))[0].delay_ns / 1e6 for h in hours]
+    assert abs(np.mean(found) - 20) < 1e-6 and abs(np.std(found) - 8 / math.sqrt(2)) < 1e-5
+    (row,) = Pipeline(options("delay=diurnal(20, 8)"), "N1").apply(0, frame(0), 0, 18 * 3600 * 10**9)
+    assert row.delay_ns == 28_000_000
 
 
 def test_courses_go_by_stream_time_not_by_speed() -> None:
@@ -116,6 +135,66 @@ def test_each_copy_has_its_own_delay() -> None:
     assert by_copy[0] == delays("normal(100, 5)", 300).tolist()
     for copy in (1, 2):
         assert abs(np.corrcoef(by_copy[0], by_copy[copy])[0, 1]) < 5 / math.sqrt(300)
+
+
+TERMS = st.sampled_from(
+    ["constant(5)", "-3", "normal(0, 5)", "uniform(0, 30)", "trace(1, -2, 3)", "gamma(4, 2)", "histogram(1, 2, 1)"]
+)
+RUNS = st.lists(st.tuples(st.integers(0, 3 * ANCHOR), st.integers(1, 700)), min_size=1, max_size=4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(TERMS, max_size=3), st.sampled_from(["", " corr=50%"]), RUNS)
+def test_delays_of_many_frames_are_those_of_each(terms: list[str], corr: str, runs: list[tuple[int, int]]) -> None:
+    """In any order of indices, over block borders, anchors and jumps."""
+    profile = options(f"delay={' + '.join(terms)}{corr}") if terms else options()
+    many, single = pipeline(profile), pipeline(profile)
+    index = np.concatenate([np.arange(first, first + count) for first, count in runs])
+    found = many.delays_ns(index)
+    assert found is not None and found.dtype == np.int64 and found.min() >= 0
+    some = np.unique(np.linspace(0, index.size - 1, 200).astype(int))
+    rows = [single.apply(int(index[at]), b"\xaa\x01", 7) for at in some]
+    assert [(row.delay_ns, row.offset_ns, row.fate) for (row,) in rows] == [
+        (found[at], found[at] + 7, Fate.SENT) for at in some
+    ]
+    assert many.clear is (not terms)
+    assert pipeline(profile).delays_ns(np.arange(0)) is not None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "loss=0%",
+        "drop=5",
+        "duplicate=1%",
+        "reorder=1%",
+        "rate=1M",
+        "slot=5",
+        "corrupt=1%",
+        "disable=5..6",
+        "config=count()",
+        "segment=1% split",
+        "delay=step(1, 2, 3)",
+        "delay=diurnal(1, 2)",
+        "delay=5 order=keep",
+        "delay=5 when=3",
+        "delay=1\n2",
+    ],
+)
+def test_where_more_than_the_index_counts_frames_go_one_by_one(text: str) -> None:
+    faults = pipeline(text)
+    assert faults.delays_ns(np.arange(3)) is None and not faults.clear
+
+
+def test_a_short_cut_waits_for_the_timeline_and_comes_back_after_it() -> None:
+    faults = pipeline(parse_profile("[at 1]\ndo = disable N1\n[at 2]\ndo = enable N1\n     pause 5\n", "t.ini"))
+    assert not faults.clear
+    play(faults, 100, close=False)
+    assert not faults.clear and faults.delays_ns(np.arange(3)) is None
+    play(faults, 100, 100, close=False)
+    assert faults.clear and faults.delays_ns(np.arange(3)).tolist() == [0, 0, 0]
+    elsewhere = pipeline(parse_profile("[at 1]\ndo = disable S1\n     seek 5\n", "t.ini"))
+    assert elsewhere.clear
 
 
 def test_only_the_selected_frames() -> None:

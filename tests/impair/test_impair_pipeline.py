@@ -10,18 +10,7 @@ from hypothesis import strategies as st
 from support.impairment import CONFIG, CONFIG_FRAME, PERIOD_NS, delays_ms, frame, options, pipeline, play
 
 from pmutools.errors import SettingsError
-from pmutools.impair import (
-    UNREPEATABLE,
-    Fate,
-    LedgerRow,
-    Outgoing,
-    Pipeline,
-    Profile,
-    ledger_row,
-    parse_action,
-    parse_profile,
-    ready_profile,
-)
+from pmutools.impair import Fate, Outgoing, Pipeline, Profile, parse_action, parse_profile, ready_profile
 from pmutools.timebase import NS
 
 EVERYTHING = options(
@@ -64,15 +53,6 @@ def test_streams_do_not_disturb_each_other() -> None:
         together += first.apply(index, frame(index), index * PERIOD_NS)
         other.apply(index, frame(index), index * PERIOD_NS)
     assert [*together, *first.close()] == alone
-
-
-def test_a_batch_is_its_frames() -> None:
-    count = 700
-    frames, due = [frame(index) for index in range(count)], [index * PERIOD_NS for index in range(count)]
-    for profile in (EVERYTHING, Profile(), options("delay=normal(16, 2)")):
-        faults = pipeline(profile)
-        batched = faults.apply_batch(0, frames, due) + list(faults.close())
-        assert batched == play(pipeline(profile), count)
 
 
 def test_the_short_cut_takes_nothing_away() -> None:
@@ -307,33 +287,6 @@ def test_counts_add_up(chosen: list[str], count: int, live: list[tuple[int, str]
     assert all((index, copy - 1) in copies for index, copy in copies if copy)
     assert all(row.offset_ns >= row.index * PERIOD_NS for row in rows)
     assert all(row.copy == 0 for row in rows if row.fate in (Fate.DROPPED, Fate.DISABLED))
-
-
-def test_ledger_rows_repeat_all_columns_they_promise() -> None:
-    def ledger(start_ns: int) -> list[LedgerRow]:
-        return [
-            ledger_row(
-                "N1",
-                row,
-                source_time_ns=row.index * PERIOD_NS,
-                time_ns=start_ns + row.index * PERIOD_NS,
-                scheduled_ns=start_ns + row.offset_ns,
-                sent_ns=start_ns + row.offset_ns + 20_000 if row.fate is Fate.SENT else None,
-            )
-            for row in play(pipeline(EVERYTHING), 1000)
-        ]
-
-    first, second = ledger(0), ledger(5 * NS)
-    assert LedgerRow._fields == (
-        *("stream", "index", "copy", "source_time_ns", "time_ns", "offset_ns", "scheduled_ns", "sent_ns"),
-        *("tx_stamp_ns", "fate", "faults", "nbytes"),
-    )
-    for a, b in zip(first, second, strict=True):
-        assert {name for name, x, y in zip(LedgerRow._fields, a, b, strict=True) if x != y} <= UNREPEATABLE
-    assert {row.fate for row in first} == {"sent", "lost", "dropped"}
-    assert ledger_row(
-        "N1", Outgoing(3, 0, b"abc", 5), source_time_ns=0, time_ns=0, scheduled_ns=0, fate=Fate.FAILED
-    ) == (*("N1", 3, 0, 0, 0, 5, 0, None, None, "failed", "", 3),)
 
 
 def test_no_release_of_ours_changes_a_run() -> None:

@@ -73,7 +73,8 @@ def test_one_grammar() -> None:
     """The same words in a file, on a command line and in live control make the same stages."""
     values = {
         "corrupt": "1% bits(2) field=stat when=every 7",
-        "disable": "5..8",
+        "config": "add(analogs=2) cfgcnt=keep announce=60 notice=no when=5..8",
+        "disable": "5..8 release=burst tcp=rst",
         "drop": "100,200-210,every 100 offset 3",
         "loss": "gemodel(1%, 20%)",
         "duplicate": "5% count=2",
@@ -81,6 +82,7 @@ def test_one_grammar() -> None:
         "reorder": "5% depth=2",
         "rate": "64k overhead=28",
         "slot": "uniform(80, 120) frames=4",
+        "segment": "5% split(parts=3, gap=5) when=every 2",
     }
     assert values.keys() == OPTIONS.keys()
     for option, text in values.items():
@@ -133,11 +135,11 @@ def test_numbers_from_a_file(tmp_path: Path) -> None:
         ("[stream]\nloss = 5%", "p.ini:1: [stream]: unknown section; did you mean 'stream NAME'?"),
         ("[run]\nsede = 5", "p.ini:2: [run] sede: unknown key; did you mean 'seed'?"),
         ("[run]\nseed = -5", "p.ini:2: [run] seed: -5 is out of range; it must be 0 to 1.84467e+19"),
-        ("[at noon]\ndo = pause", "p.ini:1: [at noon]: 'noon' is not a number; write [at SECONDS]"),
+        ("[at noon]\ndo = pause 5", "p.ini:1: [at noon]: 'noon' is not a number; write [at SECONDS]"),
         ("[at 5]", "p.ini:1: [at 5]: nothing to do; add a line 'do = disable NAME'"),
         (
             "[at 5]\ndo = disable N1\n     pause",
-            "p.ini:2: [at 5] do: pause cannot be scheduled; a timeline can enable, disable, fault",
+            "p.ini:2: [at 5] do: pause for how long? stream time stands still meanwhile; write 'pause SECONDS'",
         ),
         ("[at 5]\ndp = pause", "p.ini:2: [at 5] dp: unknown key; known: do"),
         ("[at 5]\ndo = disabel N1", "p.ini:2: [at 5] do: 'disabel' is nothing to do; did you mean 'disable'?"),
