@@ -229,7 +229,12 @@ def selector_of_any(text: str) -> Selector:
     return _selector(text, _TYPES["any"])
 
 
+_MOST_GROUPS = 100
+
+
 def _selector(text: str, types: frozenset[FrameType]) -> Selector:
+    if text.count("(") > _MOST_GROUPS:
+        raise ValueError(f"more than {_MOST_GROUPS} brackets; write it shorter")
     terms = _terms(text)
     if not any(atom.types for atom in Group(terms).atoms()):
         terms = tuple((*term, Atom(types=types)) for term in terms)

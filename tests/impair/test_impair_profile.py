@@ -167,7 +167,8 @@ def test_option_errors() -> None:
 
 PIECES = """
 normal ( ) 16 , 2 % + corr= when= every 7 .. not and or type data gemodel trace bits field= stat k none - = é mixture
-order= mixture( normal(16,2) 50% @x
+order= mixture( normal(16,2) 50% @x value A.freq_hz < & == "A wall stamp second slot first after config
+2016-09-08T17:05:11Z add(1) announce=5 split tcp=rst histogram(1,2,3) diurnal leap(1)
 """
 WORDS = st.lists(st.sampled_from([*PIECES.split(), " ", "\n"]), max_size=10).map("".join)
 

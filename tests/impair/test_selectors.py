@@ -182,6 +182,7 @@ def test_the_usual_ones_are_short_cuts() -> None:
         ("1) and 2", "'1) and 2' has a ')' without '('"),
         ("(1) 2", "'(1) 2': write 'and' or 'or' after ')'"),
         ("()", "nothing is selected"),
+        ("(" * 5000 + "1" + ")" * 5000, "more than 100 brackets; write it shorter"),
         ("wall 5", "wall 5: write START..END in seconds"),
         ("stamp 2016-09-08T17:05:11Z", "stamp 2016-09-08T17:05:11Z: write START..END in UTC"),
         ("stamp 5..8", "not an ISO-8601 time: '5' (as in 2016-09-08T17:05:11.25Z)"),
