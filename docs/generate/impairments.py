@@ -6,18 +6,21 @@ from collections.abc import Mapping
 from typing import Any
 
 from generate.markdown import code, fenced, prose, table
+from pmutools.impair import config_change, segment
 from pmutools.impair.content import KINDS
 from pmutools.impair.delays import COURSES, Trace
 from pmutools.impair.distributions import DISTRIBUTIONS, LIMITS
 from pmutools.impair.losses import LOSSES
 from pmutools.impair.profiles import READY
 from pmutools.impair.scope import FIELDS
-from pmutools.impair.source_faults import STAT_BITS
+from pmutools.impair.source_faults import LEAP_BITS, STAT_BITS
 from pmutools.impair.stages import OPTIONS, SEVERAL
+from pmutools.impair.verbs import PLAYER
 from pmutools.parsers import is_optional, settable
 
 WORDS = {
     "corrupt": "content faults: bytes that are wrong, or true bytes that say something false",
+    "config": "the configuration changes, with or without notice",
     "disable": "the stream falls silent: at frame indices, over stream time, or by order",
     "drop": "named frames never leave",
     "loss": "a loss model decides",
@@ -26,8 +29,24 @@ WORDS = {
     "reorder": "a frame that others overtake",
     "rate": "a bit rate with a queue",
     "slot": "everything waiting leaves at once",
+    "segment": "how the bytes of a frame meet a TCP connection",
 }
 """What each stage is, for the table of stages; a stage without words is an error there."""
+UNITS = {
+    "shape": "no unit",
+    "sample": "ms each",
+    "bins": "ms, ms, count",
+    "points": "% and ms",
+    "components": "% and DIST",
+    "values": "ms each",
+    "time": "s",
+    "start": "s",
+    "end": "s",
+    "period": "s",
+    "phase": "degrees",
+    "peak": "h UTC",
+}
+"""Units of the parameters of delays, where these are not ms."""
 
 
 def call(name: str, cls: type[Any]) -> str:
@@ -42,6 +61,21 @@ def call(name: str, cls: type[Any]) -> str:
 def models(of: Mapping[str, type[Any]]) -> str:
     """One row a model: how it is written, and its docstring."""
     return table(("written", "meaning"), ((code(call(name, cls)), prose(cls.__doc__)) for name, cls in of.items()))
+
+
+def delays(of: Mapping[str, type[Any]]) -> str:
+    """As :func:`models`, with the units of the parameters."""
+    rows = []
+    for name, cls in of.items():
+        units = ", ".join(f"{code(key)} {UNITS.get(key, 'ms')}" for key in settable(cls))
+        rows.append((code(call(name, cls)), units, prose(cls.__doc__)))
+    return table(("written", "parameters", "meaning"), rows)
+
+
+def verbs() -> str:
+    """The player's verbs, and whether a timeline takes them."""
+    rows = ((code(verb.usage), "no" if verb.unscheduled else "yes", verb.unscheduled) for verb in PLAYER.values())
+    return table(("verb", "in a timeline", "why not"), rows)
 
 
 def stages() -> str:
@@ -61,10 +95,14 @@ def ready() -> str:
 GENERATORS = {
     "stages": stages,
     "loss-models": lambda: models(LOSSES),
-    "delay-distributions": lambda: models(DISTRIBUTIONS),
+    "delay-distributions": lambda: delays(DISTRIBUTIONS),
     "delay-limits": lambda: ", ".join(code(f"{name}=") for name in LIMITS),
-    "delay-courses": lambda: models({"trace": Trace, **COURSES}),
+    "delay-courses": lambda: delays({"trace": Trace, **COURSES}),
     "content-faults": lambda: models(KINDS),
+    "config-changes": lambda: models(config_change.KINDS),
+    "segment-ways": lambda: models(segment.KINDS),
+    "player-verbs": verbs,
+    "leap-flags": lambda: ", ".join(map(code, LEAP_BITS)),
     "fault-fields": lambda: ", ".join(map(code, FIELDS)),
     "stat-names": lambda: table(
         ("name", "mask"), ((code(name), code(f"{mask:#06x}")) for name, mask in STAT_BITS.items())
