@@ -141,7 +141,7 @@ def command(
     if fps is not None:
         reel = at_rate(reel, fps)
     cast = emulated(reel, emulate, options.seed or 0) if emulate else as_recorded(reel)
-    for pattern in options.profile.unmatched((part.name, *part.aliases) for part in cast.parts):
+    for pattern in options.profile.unmatched(cast.names(part) for part in range(len(cast.parts))):
         talk.say(f"no stream is called {pattern!r}; there are {', '.join(part.name for part in cast.parts)}")
     with (
         interruptible() as stop,

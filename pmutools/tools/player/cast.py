@@ -51,14 +51,17 @@ class Part:
 
     track: int
     name: str
-    aliases: tuple[str, ...]
-    """Other names that patterns may mean: its IDCODE, its stations."""
     idcode: int
     phase_ns: int = 0
     gain: float = 1.0
     turn_rad: float = 0.0
     offset_hz: float = 0.0
     emulated: bool = False
+
+    @property
+    def aliases(self) -> tuple[str, ...]:
+        """Other names that patterns may mean."""
+        return (str(self.idcode),)
 
     @property
     def altered(self) -> bool:
@@ -93,6 +96,8 @@ class Cast:
         self._latest_ns = int(self.phases.max())
         self._from_ns = self._to_ns = -1
         self._ahead = self._cut(-1, -1)
+        self.editions = self.first_editions()
+        """(P,) the edition that each part begins with."""
         self._configs: dict[tuple[int, int], StreamConfig] = {}
         self._others: dict[StreamConfig, int] = {}
 
@@ -146,6 +151,12 @@ class Cast:
             self._configs[part, edition] = found
         return found
 
+    def names(self, part: int) -> tuple[str, ...]:
+        """What patterns may call a part: its name, its IDCODE, its stations."""
+        own = self.parts[part]
+        first = self.config(part, int(self.editions[part]))
+        return (own.name, *own.aliases, *(station.name for station in first.stations))
+
     def first_editions(self) -> npt.NDArray[np.int32]:
         """The edition that each part (P,) begins with."""
         rows = self.reel.rows
@@ -185,7 +196,7 @@ class Cast:
 
 def as_recorded(reel: Reel) -> Cast:
     """Each track as itself."""
-    parts = [Part(number, track.name, track.names[1:], track.config.idcode) for number, track in enumerate(reel.tracks)]
+    parts = [Part(number, track.name, track.config.idcode) for number, track in enumerate(reel.tracks)]
     return Cast(reel, parts)
 
 
@@ -205,7 +216,7 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         idcode = (first - 1 + number) % IDCODES + 1
         rate = Fraction(reel.fps) if reel.fps is not None else track.config.rate
         phase_ns = int(NS / rate * number / count) if stagger and rate else 0
-        part = Part(place, name, (str(idcode),), idcode, phase_ns, emulated=True)
+        part = Part(place, name, idcode, phase_ns, emulated=True)
         parts.append(_spread(part, spread, seed) if spread else part)
     return Cast(reel, parts)
 

@@ -6,15 +6,14 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from pmutools.c37118.session import Served
 from pmutools.clock import Clock
-from pmutools.flow import Hangup
 from pmutools.net.cargo import Frames
 from pmutools.net.server import Senders
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.ledger import LedgerWriter
+from pmutools.tools.player.plan import Gate
 from pmutools.tools.player.reel import I64
 from pmutools.tools.player.results import Results
 from pmutools.tools.player.sheet import FAILED, SENT, SKIPPED, Sheet
@@ -37,18 +36,18 @@ class Delivery:
         clock: Clock,
         results: Results,
         offers: Callable[[int, int], Served],
-        editions: npt.NDArray[np.int32],
         ledger: LedgerWriter | None,
     ) -> None:
         self._senders, self._cast, self._clock = senders, cast, clock
         self._handles = np.array(handles, np.int64)
         self._results, self._offers, self._ledger = results, offers, ledger
-        self._editions = editions
-        self._hung = np.zeros(len(handles), np.bool_)
+        self._editions = cast.editions.copy()
 
     def send(self, sheet: Sheet, anchor_ns: int, serve: Serve) -> bool:
         """Send a sheet whose offset 0 is at ``anchor_ns``; false if told to stop, with the rest left out."""
         count = len(sheet)
+        if not count:
+            return True
         base = self._ledger.rows if self._ledger is not None else 0
         frames = Frames(
             self._handles[sheet.part],
@@ -73,7 +72,7 @@ class Delivery:
                     break
                 continue
             if done == stops[0]:
-                self._turn(sheet, stops.pop(0))
+                self._reconfigure(sheet, stops.pop(0))
             if self._senders.stale(cargo):
                 cargo = self._senders.load(frames)
                 counts[done:] = cargo.counts[done:]
@@ -98,38 +97,33 @@ class Delivery:
             self._ledger.stamp(*self._senders.departures())
 
     def _stops(self, sheet: Sheet) -> list[int]:
-        """The rows before which something other than a copy is to be done."""
-        sent = sheet.fate == SENT
-        if not sheet.special and not self._hung.any() and np.array_equal(self._editions[sheet.part], sheet.edition):
+        """The rows whose configuration is another than that of the stream's row before."""
+        sent = np.flatnonzero(sheet.fate == SENT)
+        if np.array_equal(self._editions[sheet.part[sent]], sheet.edition[sent]):
             return []
-        editions, hung, stops = self._editions.copy(), self._hung.copy(), []
-        for row in range(len(sheet)):
-            part, extra = sheet.part[row], sheet.extra[row]
-            hangs = extra is not None and extra.hangup is not Hangup.SILENCE and not hung[part]
-            returns = sent[row] and (hung[part] or editions[part] != sheet.edition[row])
-            if hangs or returns:
+        editions, stops = self._editions.copy(), []
+        for row in sent.tolist():
+            if editions[sheet.part[row]] != sheet.edition[row]:
+                editions[sheet.part[row]] = sheet.edition[row]
                 stops.append(row)
-                hung[part] = hangs
-                editions[part] = sheet.edition[row]
         return stops
 
-    def _turn(self, sheet: Sheet, row: int) -> None:
-        """Do what is to be done before a row: hang up, come back, change the configuration."""
-        part, extra = int(sheet.part[row]), sheet.extra[row]
-        handle = int(self._handles[part])
-        if sheet.fate[row] != SENT:
-            self._hung[part] = True
-            self._senders.hang_up(handle, extra.hangup)
-            return
-        if self._hung[part]:
-            self._hung[part] = False
-            self._senders.take_up(handle)
-        edition = int(sheet.edition[row])
+    def _reconfigure(self, sheet: Sheet, row: int) -> None:
+        """Offer another configuration; everyone who gets the data gets it before them, asked for or not."""
+        part, edition, extra = int(sheet.part[row]), int(sheet.edition[row]), sheet.extra[row]
         before, self._editions[part] = int(self._editions[part]), edition
         if self._cast.config(part, before) == self._cast.config(part, edition):
             return
-        offer = self._offers(part, edition)
+        handle, offer = int(self._handles[part]), self._offers(part, edition)
         self._senders.replace(handle, offer)
         if extra is None or extra.notice:
             announcements = offer.announcements(self._clock.realtime_ns())
             self._senders.publish([(handle, frame) for frame in announcements])
+
+    def turn(self, gate: Gate) -> None:
+        """Hang up on a stream's TCP clients, or let them come back."""
+        handle = int(self._handles[gate.part])
+        if gate.hangup is None:
+            self._senders.take_up(handle)
+        else:
+            self._senders.hang_up(handle, gate.hangup)

@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
+from pmutools.flow import Hangup
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
-from pmutools.impair.profile import Action
+from pmutools.impair.profile import Action, Place
 from pmutools.pacing import Playback
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
@@ -32,6 +33,14 @@ from pmutools.tools.player.stamps import StampPolicy, on_grid, shifted
 _FATE_CODES = {fate: code for code, fate in enumerate(FATES)}
 _BUCKET_NS = 10_000_000
 """What waits for its time is sorted into buckets of this length."""
+
+
+class Gate(NamedTuple):
+    """At ``offset_ns`` TCP clients of ``part`` are hung up on; None: they may come back."""
+
+    offset_ns: int
+    part: int
+    hangup: Hangup | None
 
 
 class _Origin(NamedTuple):
@@ -286,11 +295,17 @@ class Plan:
                     self._playback.running,
                 )
             case "seek":
-                self.seek(offset_ns, int(action.values[0]))
+                self.seek(offset_ns, self._position(action.values[0]))
             case "loop":
-                self.between_ns = (int(action.values[0]), int(action.values[1])) if action.values else None
+                self.between_ns = None
+                if action.values:
+                    self.between_ns = (self._position(action.values[0]), self._position(action.values[1]))
                 if self.between_ns is not None and not self.between_ns[0] <= self.position_ns < self.between_ns[1]:
                     self.seek(offset_ns, self.between_ns[0])
+
+    def _position(self, place: Place) -> int:
+        """Within the recording."""
+        return place.ns if place.relative else place.ns - int(self._reel.rows.stamp_ns[0])
 
     def seek(self, offset_ns: int, position_ns: int) -> None:
         """Go to a position, in the present round; a paused player stays paused."""
@@ -339,7 +354,12 @@ class Plan:
         latency_ns = 0 if reel.spaced else due_ns - int(reel.rows.stamp_ns[row])
         return stamp_ns + latency_ns - (due_ns - reel.first_due_ns - position_ns)
 
-    # --- faults, live
+    # --- streams
+
+    def gates(self) -> list[Gate]:
+        """What TCP clients are to see of streams that fall silent, and come back, in what was planned since last asked."""
+        gates, self._route.gates = self._route.gates, []
+        return gates
 
     def fault(self, action: Action) -> list[int]:
         """Do a stream's verb, from the next planned frame on; gives the parts that it concerns."""
@@ -357,10 +377,14 @@ class _Route:
     def __init__(self, cast: Cast, pipelines: Sequence[Pipeline], *, marks: bool) -> None:
         self._cast, self._pipelines, self._marks = cast, pipelines, marks
         self._origins: list[dict[int, _Origin]] = [{} for _ in pipelines]
-        self._edition = cast.first_editions()
+        self._edition = cast.editions.copy()
+        self.gates: list[Gate] = []
+        self._hung: dict[int, Hangup | None] = {}
         self._mode = np.array([_mode(pipeline) for pipeline in pipelines], np.int8)
 
     def act(self, action: Action) -> list[int]:
+        for part in np.flatnonzero(self._mode == _CLEAR).tolist():
+            self._pipelines[part].delays_ns(np.zeros(1, np.int64))  # it has not seen the frames that passed it by
         concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
         for part in concerned:
             self._mode[part] = _mode(self._pipelines[part])
@@ -441,6 +465,10 @@ class _Route:
                 index, sheet.frame(row), int(sheet.offset_ns[row]), int(stream_ns[row]), stamp_ns=source_ns
             )
             self._take(part, done, out)
+            hangup = None if pipeline.hangup is Hangup.SILENCE else pipeline.hangup
+            if hangup is not self._hung.get(part):
+                self._hung[part] = hangup
+                self.gates.append(Gate(int(sheet.offset_ns[row]), part, hangup))
             if not pipeline.holding:
                 origins.clear()
                 self._mode[part] = _mode(pipeline)
@@ -487,7 +515,7 @@ class _Route:
 
 
 def _extra(copy: Outgoing) -> Extra | None:
-    extra = Extra(copy.write, copy.hangup, copy.notice)
+    extra = Extra(copy.write, copy.notice)
     return None if extra == _ORDINARY else extra
 
 

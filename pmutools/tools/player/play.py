@@ -81,8 +81,7 @@ class Player:
     ) -> None:
         self.cast, self.options, self.clock = cast, options, clock
         self._stop, self._tell, self._warn = stop, tell, warn
-        self._editions = cast.first_editions()
-        configs = [cast.config(part, int(edition)) for part, edition in enumerate(self._editions)]
+        configs = [cast.config(part, int(edition)) for part, edition in enumerate(cast.editions)]
         names = [part.name for part in cast.parts]
         self.results = Results(names, configs)
         self.pipelines = [
@@ -105,7 +104,7 @@ class Player:
             clock, cfg_period_ns=options.cfg_period_ns or None, stamp_departures=stamp_departures
         )
         try:
-            self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(self._editions)]
+            self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(cast.editions)]
             for endpoint in options.to:
                 self.senders.send_to(endpoint, self._picked(endpoint))
             for endpoint in options.listen:
@@ -166,7 +165,6 @@ class Player:
             clock,
             self.results,
             lambda part, edition: _offer(self.cast, part, edition),
-            self._editions,
             ledger,
         )
         self._state = PlayState.PLAYING
@@ -201,11 +199,19 @@ class Player:
                 continue
             until_ns = next_ns + sheet_ns
             sheet = plan.until(until_ns if last_ns is None else min(until_ns, last_ns))
-            if len(sheet) and not delivery.send(sheet, self._anchor_ns, self._serve_until):
+            for gate in plan.gates():
+                first = int(sheet.offset_ns.searchsorted(gate.offset_ns))
+                if not delivery.send(sheet.take(slice(0, first)), self._anchor_ns, self._serve_until):
+                    return False
+                sheet = sheet.take(slice(first, None))
+                if not self._serve_until(self._anchor_ns + gate.offset_ns):
+                    return False
+                delivery.turn(gate)
+            if not delivery.send(sheet, self._anchor_ns, self._serve_until):
                 return False
 
     def _sheet_ns(self) -> int:
-        rates = [self.cast.config(part, int(edition)).rate for part, edition in enumerate(self._editions)]
+        rates = [self.cast.config(part, int(edition)).rate for part, edition in enumerate(self.cast.editions)]
         total = sum(map(float, rates)) * float(self.options.speed)
         return int(min(SHEET_NS, max(1_000_000, SHEET_FRAMES / total * NS))) if total else SHEET_NS
 
@@ -281,7 +287,8 @@ class Player:
         if self._state is PlayState.ENDED:
             raise SettingsError("the play has ended")
         if action.verb in STREAM_VERBS:
-            if action.rule is not None and not any(action.rule.matches(p.names) for p in self.pipelines):
+            names = [self.cast.names(part) for part in range(len(self.cast.parts))]
+            if action.rule is not None and not any(map(action.rule.matches, names)):
                 there = ", ".join(part.name for part in self.cast.parts[:20])
                 raise SettingsError(
                     f"{action.verb} {', '.join(action.rule.patterns)}: no such stream; there are {there}"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.flow import Hangup, Segmentation
+from pmutools.flow import Segmentation
 from pmutools.impair.outgoing import Fate
 from pmutools.tools.player.reel import I64
 
@@ -18,11 +18,9 @@ SENT, FAILED, SKIPPED = (FATES.index(fate) for fate in (Fate.SENT, Fate.FAILED, 
 
 
 class Extra(NamedTuple):
-    """What few copies have: how they are written to TCP, what TCP clients see of a gate that is shut, and whether a
-    changed configuration is announced unasked."""
+    """What few copies have: how they are written to TCP, and whether a changed configuration is announced unasked."""
 
     write: Segmentation | None = None
-    hangup: Hangup = Hangup.SILENCE
     notice: bool = True
 
 
