@@ -14,6 +14,7 @@ COMMANDS = {
     "convert": ("pmutools.cli.convert", "Recordings to another format."),
     "synth": ("pmutools.cli.synth", "A recording made by a simulated grid and its PMUs."),
     "play": ("pmutools.cli.play", "Stream a recording live, as any number of PMUs."),
+    "ctl": ("pmutools.cli.ctl", "Control a running player."),
     "read": ("pmutools.cli.read", "Read live streams and log them."),
 }
 
