@@ -121,23 +121,8 @@ def test_a_line_of_progress() -> None:
 def test_the_table() -> None:
     lines = status_lines(player_status(3), 110)
     assert lines[0] == "PLAYING  12.500 / 30.000 s  loop 2, between 5 and 20 s"
-    assert lines[3].split() == [
-        "stream",
-        "id",
-        "on",
-        "to",
-        "sent",
-        "lost",
-        "drop",
-        "disab",
-        "skip",
-        "fail",
-        "p50us",
-        "p99us",
-        "maxus",
-        "miss",
-        "faults",
-    ]
+    assert " ".join(lines[3].split()[:8]) == "stream id on to sent lost drop disab"
+    assert " ".join(lines[3].split()[8:]) == "skip fail p50us p99us maxus miss faults"
     assert lines[5].endswith("loss=gemodel(1%,20%)  delay=normal(16,2) corr=30%")
     assert lines[6].split()[:3] == ["S1", "103", "OFF"]
 
