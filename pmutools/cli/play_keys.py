@@ -1,0 +1,305 @@
+"""The keys of the interactive player: bytes to keys, and keys to things to do; no terminal, no clock.
+
+:data:`KEYS` is the table from which the help line, the help page and the documentation are made.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from glob import escape
+from typing import NamedTuple
+
+from pmutools.impair.profile import Action
+from pmutools.timebase import NS
+from pmutools.tools.player.control import BY_NAME, parse_control
+from pmutools.tools.player.status import PlayerStatus, PlayState, StreamStatus
+from pmutools.tools.window import parse_moment
+
+EVENTS = 40
+"""Events kept for the screen."""
+PROMPT_CHARACTERS = 1000
+FASTER = 1.1
+SPEEDS = (0.001, 1000.0)
+
+
+# --- what the screen shows beside the player's state -------------------------------------------------------------
+
+
+class Prompt(NamedTuple):
+    """A line being typed: what it is for, as :data:`PROMPTS` names it, and its text so far."""
+
+    kind: str
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ui:
+    """What belongs to the person at the terminal; each key gives the next one."""
+
+    selected: int = 0
+    rows: int = 10
+    """Streams on a page."""
+    prompt: Prompt | None = None
+    help: bool = False
+    mark_a: float | None = None
+    message: str = ""
+    error: bool = False
+    """Whether the message is one."""
+    events: tuple[str, ...] = ()
+
+    def said(self, message: str, *, error: bool = False) -> Ui:
+        return replace(self, message=message, error=error)
+
+    def noted(self, event: str) -> Ui:
+        return replace(self, events=(*self.events, event)[-EVENTS:])
+
+
+class Step(NamedTuple):
+    """What a key leads to: the next state, things for the player to do, the end."""
+
+    ui: Ui
+    do: tuple[Action, ...] = ()
+    quit: bool = False
+
+
+class Key(NamedTuple):
+    """Keys that do the same: their names as decoded, what they are called, a word for the help line, the meaning."""
+
+    names: tuple[str, ...]
+    shown: str
+    label: str
+    meaning: str
+    press: Callable[[Ui, PlayerStatus], Step]
+
+
+def _do(ui: Ui, *lines: str) -> Step:
+    """Things to do that were written here, or typed; what cannot be is a message."""
+    try:
+        actions = tuple(parse_control(line) for line in lines)
+    except ValueError as error:
+        return Step(ui.said(str(error), error=True))
+    if any(BY_NAME[action.verb].internal for action in actions):
+        return Step(ui.said("that is on the screen already; '?' lists the keys"))
+    return Step(ui.said("; ".join(lines)), actions)
+
+
+def _pause(ui: Ui, status: PlayerStatus) -> Step:
+    return _do(ui, "pause" if status.state is PlayState.PLAYING else "resume")
+
+
+def _step(ui: Ui, status: PlayerStatus) -> Step:
+    return _do(ui, "pause", "step") if status.state is PlayState.PLAYING else _do(ui, "step")
+
+
+def _times(factor: float) -> Callable[[Ui, PlayerStatus], Step]:
+    def press(ui: Ui, status: PlayerStatus) -> Step:
+        speed = min(max(status.speed * factor, SPEEDS[0]), SPEEDS[1])
+        return _do(ui, f"speed {1 if abs(speed - 1) < 0.02 else speed:.6g}")  # back at exactly 1 on the way
+
+    return press
+
+
+def _seek(by_s: float) -> Callable[[Ui, PlayerStatus], Step]:
+    return lambda ui, status: _do(ui, f"seek {seconds(max(status.position_s + by_s, 0.0))}")
+
+
+def _mark_a(ui: Ui, status: PlayerStatus) -> Step:
+    return Step(replace(ui, mark_a=status.position_s).said(f"A is {seconds(status.position_s)} s; 'b' ends the loop"))
+
+
+def _mark_b(ui: Ui, status: PlayerStatus) -> Step:
+    if ui.mark_a is None:
+        return Step(ui.said("no A yet; press 'a' where the loop begins", error=True))
+    if status.position_s <= ui.mark_a:
+        return Step(ui.said(f"B is not after A, {seconds(ui.mark_a)} s; go on, or mark A anew", error=True))
+    return _do(ui, f"loop {seconds(ui.mark_a)} {seconds(status.position_s)}")
+
+
+def _unmark(ui: Ui, status: PlayerStatus) -> Step:
+    return _do(replace(ui, mark_a=None), "loop off")
+
+
+def _select(by: Callable[[Ui], int], *, wrap: bool = False) -> Callable[[Ui, PlayerStatus], Step]:
+    def press(ui: Ui, status: PlayerStatus) -> Step:
+        last = len(status.streams) - 1
+        wanted = ui.selected + by(ui)
+        selected = wanted % (last + 1) if wrap and last >= 0 else max(0, min(wanted, last))
+        return Step(replace(ui, selected=selected))
+
+    return press
+
+
+def _enable(ui: Ui, status: PlayerStatus) -> Step:
+    if (stream := chosen(ui, status)) is None:
+        return Step(ui.said("there is no stream", error=True))
+    return _do(ui, f"{'disable' if stream.enabled else 'enable'} {pattern(stream)}")
+
+
+def _ask(kind: str) -> Callable[[Ui, PlayerStatus], Step]:
+    return lambda ui, status: Step(replace(ui, prompt=Prompt(kind)).said(""))
+
+
+KEYS = (
+    Key(("SPACE",), "SPACE", "pause", "Pause, resume.", _pause),
+    Key((".", "RIGHT"), ". →", "step", "The next frame instant; pauses first.", _step),
+    Key(("+", "=", "UP"), "+ ↑", "faster", "Speed times 1.1.", _times(FASTER)),
+    Key(("-", "DOWN"), "- ↓", "slower", "Speed divided by 1.1.", _times(1 / FASTER)),
+    Key(("1",), "1", "", "Speed 1.", lambda ui, status: _do(ui, "speed 1")),
+    Key(("[", "LEFT"), "[ ←", "-1s", "Back 1 s.", _seek(-1)),
+    Key(("]",), "]", "+1s", "Forward 1 s.", _seek(1)),
+    Key(("{",), "{", "", "Back 10 s.", _seek(-10)),
+    Key(("}",), "}", "", "Forward 10 s.", _seek(10)),
+    Key(("g",), "g", "goto", "Go to a time: seconds into the source, or UTC.", _ask("goto")),
+    Key(("a",), "a", "A", "Mark A, where a loop is to begin.", _mark_a),
+    Key(("b",), "b", "B", "Mark B, and play from A to B over and over.", _mark_b),
+    Key(("c",), "c", "clear", "End the loop between A and B.", _unmark),
+    Key(("n", "TAB"), "n TAB", "next", "Select the next stream.", _select(lambda ui: 1, wrap=True)),
+    Key(("p", "BACKTAB"), "p", "", "Select the stream before.", _select(lambda ui: -1, wrap=True)),
+    Key(("PGDN",), "PGDN", "", "The next page of streams.", _select(lambda ui: ui.rows)),
+    Key(("PGUP",), "PGUP", "", "The page before.", _select(lambda ui: -ui.rows)),
+    Key(("e",), "e", "on/off", "Silence the selected stream, or let it speak again.", _enable),
+    Key(("f",), "f", "fault", "Set a fault of the selected stream: `loss=5%`, `loss=none`.", _ask("fault")),
+    Key((":",), ":", "any", "Anything that `pmu ctl` can do.", _ask("do")),
+    Key(("?",), "?", "help", "These keys.", lambda ui, status: Step(replace(ui, help=True))),
+    Key(("q",), "q", "quit", "End the player.", lambda ui, status: Step(ui.said("ending"), quit=True)),
+)
+_BY_NAME = {name: key for key in KEYS for name in key.names}
+
+PROMPTS = {"goto": "go to (seconds, or UTC): ", "fault": "fault of {}: ", "do": ": "}
+"""What is asked for; the braces stand for the selected stream."""
+
+
+def press(ui: Ui, name: str, status: PlayerStatus) -> Step:
+    """What one key does."""
+    if ui.prompt is not None:
+        return _typed(ui, ui.prompt, name, status)
+    if ui.help:
+        return Step(replace(ui, help=False))
+    key = _BY_NAME.get(name)
+    return key.press(ui, status) if key is not None else Step(ui)
+
+
+def _typed(ui: Ui, prompt: Prompt, name: str, status: PlayerStatus) -> Step:
+    text = prompt.text
+    match name:
+        case "ESC":
+            return Step(replace(ui, prompt=None).said(""))
+        case "ENTER":
+            return _entered(ui, prompt, status)
+        case "BACKSPACE":
+            if not text:
+                return Step(replace(ui, prompt=None).said(""))
+            text = text[:-1]
+        case "ERASE":
+            text = ""
+        case "SPACE":
+            text += " "
+        case _ if len(name) == 1:
+            text += name
+    return Step(replace(ui, prompt=prompt._replace(text=text[:PROMPT_CHARACTERS])).said(""))
+
+
+def _entered(ui: Ui, prompt: Prompt, status: PlayerStatus) -> Step:
+    """A typed line; one that cannot be stays, to be mended."""
+    text, stream = prompt.text.strip(), chosen(ui, status)
+    if not text:
+        return Step(replace(ui, prompt=None))
+    if prompt.kind == "goto":
+        text = f"seek {text}"
+    elif prompt.kind == "fault":
+        if stream is None:
+            return Step(replace(ui, prompt=None).said("there is no stream", error=True))
+        text = f"fault {pattern(stream)} {text}"
+    step = _do(ui, text)
+    return step if step.ui.error else step._replace(ui=replace(step.ui, prompt=None))
+
+
+def foreseen(status: PlayerStatus, action: Action) -> PlayerStatus:
+    """The state once ``action`` is done, as far as it can be told without asking the player."""
+    if action.verb == "seek":
+        moment = parse_moment(action.argument)
+        return replace(status, position_s=max(moment.ns / NS, 0.0)) if moment.relative else status
+    if action.verb == "speed":
+        return replace(status, speed=float(action.argument))
+    return replace(status, state=PlayState.PLAYING) if action.verb == "resume" else status
+
+
+def chosen(ui: Ui, status: PlayerStatus) -> StreamStatus | None:
+    """The selected stream, if there is any."""
+    count = len(status.streams)
+    return status.streams[min(ui.selected, count - 1)] if count else None
+
+
+def pattern(stream: StreamStatus) -> str:
+    """What fits this stream and no other; its IDCODE where the grammar has no way to write its name."""
+    name = stream.name
+    if not name.strip() or name != name.strip() or set('",') & set(name) or not name.isprintable():
+        return str(stream.idcode)
+    return f'"{escape(name)}"'
+
+
+def seconds(value: float) -> str:
+    """Seconds to the microsecond, without zeros at the end."""
+    return f"{value:.6f}".rstrip("0").rstrip(".")
+
+
+# --- bytes to keys -----------------------------------------------------------------------------------------------
+
+_SEQUENCES = {
+    **{
+        f"\x1b{lead}{end}".encode(): name
+        for lead in "[O"
+        for end, name in zip("ABCDHF", ("UP", "DOWN", "RIGHT", "LEFT", "HOME", "END"), strict=True)
+    },
+    b"\x1b[5~": "PGUP",
+    b"\x1b[6~": "PGDN",
+    b"\x1b[Z": "BACKTAB",
+}
+_SEQUENCE = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*[@-~]|O[ -~])")
+_BEGUN = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?")
+_LONGEST = 32
+"""Bytes of a sequence begun, after which it is taken for none."""
+_CONTROLS = {
+    0x08: "BACKSPACE",
+    0x7F: "BACKSPACE",
+    0x09: "TAB",
+    0x0A: "ENTER",
+    0x0D: "ENTER",
+    0x15: "ERASE",
+    0x20: "SPACE",
+}
+
+
+def decode(data: bytes, *, final: bool = False) -> tuple[list[str], bytes]:
+    """Keys in ``data``, and what may be the beginning of one; ``final``: nothing more comes with it."""
+    keys: list[str] = []
+    at = 0
+    while at < len(data):
+        first = data[at]
+        if first == 0x1B:
+            if match := _SEQUENCE.match(data, at):
+                if name := _SEQUENCES.get(match[0]):
+                    keys.append(name)
+                at = match.end()
+                continue
+            begun = _BEGUN.match(data, at)
+            if begun is not None and begun.end() == len(data) and not final and begun.end() - at < _LONGEST:
+                break
+            keys.append("ESC")
+            at += 1
+        elif first in _CONTROLS:
+            keys.append(_CONTROLS[first])
+            at += 1
+        elif first < 0x80:
+            keys += [chr(first)] if first >= 0x20 else []
+            at += 1
+        else:
+            length = 2 if 0xC2 <= first < 0xE0 else 3 if 0xE0 <= first < 0xF0 else 4 if 0xF0 <= first < 0xF5 else 1
+            if at + length > len(data) and not final:
+                break
+            text = data[at : at + length].decode("utf-8", "ignore")
+            keys += [text] if text.isprintable() and text else []
+            at += length if text else 1
+    return keys, data[at:]

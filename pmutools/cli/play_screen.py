@@ -1,0 +1,173 @@
+"""The interactive player's screen: a player's state and the person's, drawn for a size; pure.
+
+Every line is a rich Text of its own, so that only lines that have changed need to be drawn again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rich.cells import cell_len
+from rich.console import Group
+from rich.style import Style
+from rich.text import Text
+
+from pmutools.cli.play_keys import KEYS, PROMPTS, Ui, chosen, seconds
+from pmutools.cli.shell import visible
+from pmutools.cli.status_text import faults_text, fit, layout, misses_text, number, speed_text
+from pmutools.tools.player.status import PlayerStatus, PlayState
+
+SMALLEST = (40, 10)
+HEAD = 5
+"""Lines above the streams, with the header of their table."""
+FOOT = 3
+"""Lines below them and the events: selected stream, message, help."""
+MORE_EVENTS = 8
+
+PLAIN = Style()
+BOLD = Style(bold=True)
+DIM = Style(dim=True)
+HEADER = Style(underline=True)
+SELECTED = Style(reverse=True)
+GOOD = Style(color="green", bold=True)
+BAD = Style(color="red", bold=True)
+MARK = Style(color="magenta", bold=True)
+STATES = {PlayState.PLAYING: GOOD, PlayState.PAUSED: MARK, PlayState.WAITING: BOLD, PlayState.ENDED: BAD}
+"""Colours that can be read on dark and on light; all is said in words too, as there may be none."""
+
+
+class Title(NamedTuple):
+    """What is played, and to whom."""
+
+    source: str
+    targets: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.source} → {', '.join(self.targets)}" if self.targets else self.source
+
+
+def page_rows(height: int) -> int:
+    """How many streams fit."""
+    return max(1, height - HEAD - FOOT - (1 if height < 30 else 3))
+
+
+def render(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None = None) -> Group:
+    """The screen: exactly ``height`` lines, none wider than ``width``. ``reached`` is the speed that was measured."""
+    if width < SMALLEST[0] or height < SMALLEST[1]:
+        lines = [Text("too small: {}x{} needed".format(*SMALLEST))]
+    elif ui.help:
+        lines = _help(title, width, height)
+    else:
+        lines = _lines(status, ui, title, width, height, reached)
+    for line in lines:
+        if cell_len(line.plain) > width:
+            line.truncate(width)
+    lines += [Text() for _ in range(height - len(lines))]
+    return Group(*lines[:height])
+
+
+def _lines(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None) -> list[Text]:
+    streams, footer = _streams(status, ui, width, page_rows(height))
+    space = height - (HEAD - 1) - len(streams) - FOOT
+    events = [Text(visible(event), DIM) for event in ui.events[-min(space, MORE_EVENTS) :]] if space else []
+    filler = [Text() for _ in range(space - len(events))]
+    return [
+        Text(fit(visible(f"pmu play {title}"), width), BOLD),
+        _state(status, reached),
+        _bar(status, ui, width),
+        _late(status, ui),
+        *streams,
+        footer,
+        *filler,
+        *events,
+        _message(ui, status, width),
+        Text(help_line(width), DIM),
+    ]
+
+
+def _state(status: PlayerStatus, reached: float | None) -> Text:
+    speed = f"speed ×{speed_text(status.speed)}" + (f" reached {reached:.3f}" if reached is not None else "")
+    return Text.assemble(
+        (f"{status.state.upper():<8}", STATES[status.state]),
+        f"{status.position_s:.3f} / {status.length_s:.3f} s  loop {status.loop}  {speed}  "
+        f"{number(status.frames_per_s)} frames/s",
+    )
+
+
+def _bar(status: PlayerStatus, ui: Ui, width: int) -> Text:
+    """Where in the source; A and B over it."""
+    cells = width - 2
+
+    def cell(position_s: float) -> int:
+        return max(0, min(int(position_s / status.length_s * cells), cells - 1)) if status.length_s > 0 else 0
+
+    here = cell(status.position_s)
+    bar = Text.assemble(("[", DIM), ("━" * here, GOOD), ("●", BOLD), ("─" * (cells - here - 1), DIM), ("]", DIM))
+    marks = [*zip("AB", status.between, strict=True)] if status.between else []
+    if ui.mark_a is not None and (status.between is None or ui.mark_a != status.between[0]):
+        marks.append(("a", ui.mark_a))
+    for letter, position_s in marks:
+        at = 1 + cell(position_s)
+        bar = Text.assemble(bar[:at], (letter, MARK), bar[at + 1 :])
+    return bar
+
+
+def _late(status: PlayerStatus, ui: Ui) -> Text:
+    pacing = status.pacing
+    text = (
+        f"{number(status.sent)} sent   late p50 {number(pacing.p50_us)}  p99 {number(pacing.p99_us)}  "
+        f"max {number(pacing.max_us)} us   "
+        f"{misses_text(pacing.misses)}"
+    )
+    between = f"   A-B {seconds(status.between[0])} .. {seconds(status.between[1])} s" if status.between else ""
+    marked = f"   A marked at {seconds(ui.mark_a)} s" if ui.mark_a is not None and not between else ""
+    return Text.assemble(text, (between + marked, MARK))
+
+
+def _streams(status: PlayerStatus, ui: Ui, width: int, rows: int) -> tuple[list[Text], Text]:
+    """The table's header and a page of it; and the line that tells of the selected stream."""
+    count = len(status.streams)
+    selected = min(ui.selected, count - 1)
+    top = max(selected, 0) // rows * rows
+    table = layout(width)
+    lines = [Text(table.header(), HEADER)]
+    for index, stream in enumerate(status.streams[top : top + rows], top):
+        style = SELECTED if index == selected else DIM if not stream.enabled else PLAIN
+        lines.append(Text(table.row(stream), style))
+    if (shown := chosen(ui, status)) is None:
+        return lines, Text("no streams", DIM)
+    where = f"{top + 1}-{min(top + rows, count)} of {count}" if count > rows else f"{count} streams"
+    faults = visible(faults_text(shown.faults)) or "no faults"
+    return lines, Text.assemble((f"{where}   ", DIM), (f"▸ {visible(shown.name)}", BOLD), f"  {faults}")
+
+
+def _message(ui: Ui, status: PlayerStatus, width: int) -> Text:
+    """The prompt, or what was said last; both if what was typed was wrong."""
+    said = Text(visible(ui.message), BAD if ui.error else PLAIN)
+    if ui.prompt is None:
+        return said
+    stream = chosen(ui, status)
+    asked = PROMPTS[ui.prompt.kind].format(visible(stream.name) if stream else "")
+    text = visible(ui.prompt.text)
+    room = max(8, (width if not ui.error else width // 2) - cell_len(asked) - 2)
+    tail = text if cell_len(text) <= room else f"…{text[1 - room :]}"
+    return Text.assemble((asked, BOLD), tail, (" ", SELECTED), "   " if ui.error else "", said)
+
+
+def help_line(width: int) -> str:
+    """As many keys as fit; help and quit always."""
+    words = [f"{key.shown.split(' ')[0]} {key.label}" for key in KEYS if key.label]
+    last = words[-2:]
+    line = ""
+    for word in words[:-2]:
+        longer = f"{line}{word}  "
+        if len(longer) + len("  ".join(last)) > width:
+            break
+        line = longer
+    return line + "  ".join(last)
+
+
+def _help(title: Title, width: int, height: int) -> list[Text]:
+    keys = [Text.assemble((f"{key.shown:>8}  ", BOLD), key.meaning.replace("`", "")) for key in KEYS]
+    head = Text(fit(visible(f"pmu play {title}"), width), BOLD)
+    return [head, *keys[: height - 2], Text("any key goes back", DIM)]

@@ -1,0 +1,197 @@
+"""The interactive player's keys: bytes to keys, keys to things to do; no terminal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.controlled import FakePlayer, player_status, stream_status
+
+from pmutools.cli.play_keys import KEYS, Prompt, Step, Ui, decode, foreseen, pattern, press
+from pmutools.impair.profile import Action
+from pmutools.tools.player.control import parse_control
+from pmutools.tools.player.status import PlayState
+
+PLAYING = player_status()
+PAUSED = replace(PLAYING, state=PlayState.PAUSED)
+
+
+def said(step: Step) -> list[str]:
+    player = FakePlayer()
+    for action in step.do:
+        player.act(action)
+    return player.done
+
+
+def typed(ui: Ui, text: str) -> Step:
+    step = Step(ui)
+    for key in decode(text.encode())[0]:
+        step = press(step.ui, key, PLAYING)
+    return step
+
+
+@pytest.mark.parametrize(
+    ("key", "status", "done"),
+    [
+        ("SPACE", PLAYING, ["pause"]),
+        ("SPACE", PAUSED, ["resume"]),
+        (".", PAUSED, ["step"]),
+        ("RIGHT", PLAYING, ["pause", "step"]),
+        ("+", PLAYING, ["speed 1.1"]),
+        ("UP", replace(PLAYING, speed=2.0), ["speed 2.2"]),
+        ("-", PLAYING, ["speed 0.909091"]),
+        ("+", replace(PLAYING, speed=0.909091), ["speed 1"]),
+        ("DOWN", replace(PLAYING, speed=0.001), ["speed 0.001"]),
+        ("+", replace(PLAYING, speed=1000.0), ["speed 1000"]),
+        ("1", replace(PLAYING, speed=3.0), ["speed 1"]),
+        ("[", PLAYING, ["seek 11.5"]),
+        ("LEFT", replace(PLAYING, position_s=0.25), ["seek 0"]),
+        ("]", PLAYING, ["seek 13.5"]),
+        ("{", PLAYING, ["seek 2.5"]),
+        ("}", PLAYING, ["seek 22.5"]),
+        ("c", PLAYING, ["loop off"]),
+        ("e", PLAYING, ["disable N1"]),
+        ("x", PLAYING, []),
+        ("ESC", PLAYING, []),
+    ],
+)
+def test_a_key_is_something_to_do(key: str, status: object, done: list[str]) -> None:
+    step = press(Ui(), key, status)  # type: ignore[arg-type]
+    assert [line.replace('"', "") for line in said(step)] == done
+    assert not step.ui.error
+
+
+def test_every_key_does_something_and_none_has_two_meanings() -> None:
+    names = [name for key in KEYS for name in key.names]
+    assert len(names) == len(set(names))
+    for name in names:
+        for status in (PLAYING, player_status(0)):
+            press(Ui(selected=3), name, status)
+
+
+def test_a_to_b() -> None:
+    early = press(Ui(), "b", PLAYING)
+    assert early.ui.error
+    assert "press 'a'" in early.ui.message
+    marked = press(Ui(), "a", PLAYING).ui
+    assert marked.mark_a == 12.5
+    assert press(marked, "b", PLAYING).ui.error
+    assert said(press(marked, "b", replace(PLAYING, position_s=20.125))) == ["loop 12.5 20.125"]
+    cleared = press(marked, "c", PLAYING)
+    assert (cleared.ui.mark_a, said(cleared)) == (None, ["loop off"])
+
+
+def test_streams_are_selected() -> None:
+    ui = Ui(rows=3)
+    for key, wanted in (("n", 1), ("TAB", 2), ("p", 1), ("PGDN", 4), ("PGDN", 7), ("n", 0), ("p", 7), ("PGUP", 4)):
+        ui = press(ui, key, PLAYING).ui
+        assert ui.selected == wanted, key
+    assert said(press(replace(ui, selected=2), "e", PLAYING)) == ["enable S1"]
+    assert said(press(replace(ui, selected=99), "e", PLAYING)) == ["disable W2"]
+
+
+def test_a_fault_is_typed() -> None:
+    step = typed(press(Ui(selected=1), "f", PLAYING).ui, "loss=6%\x7f\x7f5%")
+    assert step.ui.prompt == Prompt("fault", "loss=5%")
+    step = press(step.ui, "ENTER", PLAYING)
+    assert said(step) == ["fault N2"]
+    assert step.do == (parse_control('fault "N2" loss=5%'),)
+    assert step.ui.prompt is None
+    assert step.ui.message == 'fault "N2" loss=5%'
+
+
+def test_what_is_typed_wrongly_can_be_mended() -> None:
+    step = press(typed(press(Ui(), "g", PLAYING).ui, "1x").ui, "ENTER", PLAYING)
+    assert step.ui.error
+    assert step.do == ()
+    assert step.ui.prompt == Prompt("goto", "1x")
+    step = press(typed(step.ui, "\x7f2.5").ui, "ENTER", PLAYING)
+    assert said(step) == ["seek 12.5"]
+
+
+@pytest.mark.parametrize("end", ["\x1b", "\x15\r", "\x15\x7f", "   \r"])
+def test_a_prompt_is_left(end: str) -> None:
+    ui = typed(press(Ui(), ":", PLAYING).ui, "pau" if end != "   \r" else "").ui
+    step = Step(ui)
+    for key in decode(end.encode(), final=True)[0]:
+        step = press(step.ui, key, PLAYING)
+    assert step.ui.prompt is None
+    assert step.do == ()
+
+
+def test_anything_can_be_typed() -> None:
+    step = press(typed(press(Ui(), ":", PLAYING).ui, "disable N*").ui, "ENTER", PLAYING)
+    assert said(step) == ["disable N*"]
+    step = press(typed(press(Ui(), ":", PLAYING).ui, "stats").ui, "ENTER", PLAYING)
+    assert step.do == ()
+    assert "on the screen" in step.ui.message
+    assert typed(press(Ui(), ":", PLAYING).ui, "q?1").ui.prompt == Prompt("do", "q?1")
+
+
+def test_help_and_quit() -> None:
+    ui = press(Ui(), "?", PLAYING).ui
+    assert ui.help
+    back = press(ui, "q", PLAYING)
+    assert not back.ui.help
+    assert not back.quit
+    assert press(back.ui, "q", PLAYING).quit
+
+
+@pytest.mark.parametrize("name", ["N1", "SHELBY PMU", "a[1]", "x*", "a,b", 'q"', " lead", "", "tab\t"])
+def test_a_pattern_is_of_one_stream(name: str) -> None:
+    stream = stream_status(3, name) if name else replace(stream_status(3), name="")
+    for line in (f"disable {pattern(stream)}", f"fault {pattern(stream)} loss=5%"):
+        rule = parse_control(line).rule
+        assert rule is not None
+        assert rule.matches((stream.name, str(stream.idcode)))
+        assert not rule.matches(("xyz", "1"))
+
+
+def test_what_is_foreseen() -> None:
+    assert foreseen(PLAYING, Action("seek", argument="3")).position_s == 3
+    assert foreseen(PLAYING, Action("seek", argument="2016-09-08T17:05:11Z")) == PLAYING
+    assert foreseen(PLAYING, Action("speed", argument="2")).speed == 2
+    assert foreseen(PAUSED, Action("resume")) == PLAYING
+    assert foreseen(PAUSED, Action("loop", argument="off")) == PAUSED
+
+
+# --- bytes
+
+
+@pytest.mark.parametrize(
+    ("data", "keys"),
+    [
+        (b"a+ \t\r\n\x7f\x08\x15", ["a", "+", "SPACE", "TAB", "ENTER", "ENTER", "BACKSPACE", "BACKSPACE", "ERASE"]),
+        (b"\x1b[A\x1bOB\x1b[C\x1b[D", ["UP", "DOWN", "RIGHT", "LEFT"]),
+        (b"\x1b[5~\x1b[6~\x1b[Z", ["PGUP", "PGDN", "BACKTAB"]),
+        (b"\x1b[1;5Cx\x1b[200~y\x1b[15~\x1bOP", ["x", "y"]),
+        ("é東𝄞".encode(), ["é", "東", "𝄞"]),
+        (b"\xff\xc3a\x80\x01\x00z", ["a", "z"]),
+        (b"\x1bx", ["ESC", "x"]),
+    ],
+)
+def test_bytes_are_keys_whole_and_in_pieces(data: bytes, keys: list[str]) -> None:
+    assert decode(data) == (keys, b"")
+    found, rest = list[str](), b""
+    for byte in data:
+        more, rest = decode(rest + bytes([byte]))
+        found += more
+    assert (found, rest) == (keys, b"")
+
+
+def test_escape_alone_is_a_key_once_nothing_follows() -> None:
+    assert decode(b"\x1b") == ([], b"\x1b")
+    assert decode(b"\x1b", final=True) == (["ESC"], b"")
+    assert decode(b"\x1b[1;") == ([], b"\x1b[1;")
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_keys(data: bytes) -> None:
+    keys, rest = decode(data)
+    assert len(rest) < 32
+    ui = Ui()
+    for key in keys:
+        ui = press(ui, key, PLAYING).ui
+    assert decode(rest, final=True)[1] == b""
