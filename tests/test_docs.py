@@ -182,7 +182,7 @@ def test_the_comparison_can_fail() -> None:
 
 GROUPS = {"pmu": pmu, "dcon": dcon}
 ALIASES = {"stream-player": ("pmu", "play"), "stream-reader": ("pmu", "read")}
-OTHERS = frozenset(("python", "head"))
+OTHERS = frozenset(("python", "head", "nc", "printf"))
 """Programs of others that examples use."""
 
 

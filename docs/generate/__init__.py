@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import commands, controller, impairments, streams, structure, studies
+from generate import commands, controller, impairments, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
     **streams.GENERATORS,
     **impairments.GENERATORS,
+    **player.GENERATORS,
     **controller.GENERATORS,
     **studies.GENERATORS,
     **commands.GENERATORS,

@@ -65,7 +65,7 @@ class Step(NamedTuple):
 
 
 class Key(NamedTuple):
-    """Keys that do the same: their names as decoded, what they are called, a word for the help line, the meaning."""
+    """Keys that do the same: their names as decoded, what they are called, their part of the help line, the meaning."""
 
     names: tuple[str, ...]
     shown: str
@@ -142,28 +142,28 @@ def _ask(kind: str) -> Callable[[Ui, PlayerStatus], Step]:
 
 
 KEYS = (
-    Key(("SPACE",), "SPACE", "pause", "Pause, resume.", _pause),
-    Key((".", "RIGHT"), ". →", "step", "The next frame instant; pauses first.", _step),
-    Key(("+", "=", "UP"), "+ ↑", "faster", "Speed times 1.1.", _times(FASTER)),
-    Key(("-", "DOWN"), "- ↓", "slower", "Speed divided by 1.1.", _times(1 / FASTER)),
+    Key(("SPACE",), "SPACE", "SPACE pause", "Pause, resume.", _pause),
+    Key((".", "RIGHT"), ". →", ". step", "The next frame instant; pauses first.", _step),
+    Key(("+", "=", "UP"), "+ ↑", "+- speed", "Speed times 1.1.", _times(FASTER)),
+    Key(("-", "DOWN"), "- ↓", "", "Speed divided by 1.1.", _times(1 / FASTER)),
     Key(("1",), "1", "", "Speed 1.", lambda ui, status: _do(ui, "speed 1")),
-    Key(("[", "LEFT"), "[ ←", "-1s", "Back 1 s.", _seek(-1)),
-    Key(("]",), "]", "+1s", "Forward 1 s.", _seek(1)),
+    Key(("[", "LEFT"), "[ ←", "[] seek", "Back 1 s.", _seek(-1)),
+    Key(("]",), "]", "", "Forward 1 s.", _seek(1)),
     Key(("{",), "{", "", "Back 10 s.", _seek(-10)),
     Key(("}",), "}", "", "Forward 10 s.", _seek(10)),
-    Key(("g",), "g", "goto", "Go to a time: seconds into the source, or UTC.", _ask("goto")),
-    Key(("a",), "a", "A", "Mark A, where a loop is to begin.", _mark_a),
-    Key(("b",), "b", "B", "Mark B, and play from A to B over and over.", _mark_b),
-    Key(("c",), "c", "clear", "End the loop between A and B.", _unmark),
-    Key(("n", "TAB"), "n TAB", "next", "Select the next stream.", _select(lambda ui: 1, wrap=True)),
+    Key(("g",), "g", "g goto", "Go to a time: seconds into the source, or UTC.", _ask("goto")),
+    Key(("a",), "a", "ab loop", "Mark A, where a loop is to begin.", _mark_a),
+    Key(("b",), "b", "", "Mark B, and play from A to B over and over.", _mark_b),
+    Key(("c",), "c", "", "End the loop between A and B.", _unmark),
+    Key(("n", "TAB"), "n TAB", "", "Select the next stream.", _select(lambda ui: 1, wrap=True)),
     Key(("p", "BACKTAB"), "p", "", "Select the stream before.", _select(lambda ui: -1, wrap=True)),
     Key(("PGDN",), "PGDN", "", "The next page of streams.", _select(lambda ui: ui.rows)),
     Key(("PGUP",), "PGUP", "", "The page before.", _select(lambda ui: -ui.rows)),
-    Key(("e",), "e", "on/off", "Silence the selected stream, or let it speak again.", _enable),
-    Key(("f",), "f", "fault", "Set a fault of the selected stream: `loss=5%`, `loss=none`.", _ask("fault")),
-    Key((":",), ":", "any", "Anything that `pmu ctl` can do.", _ask("do")),
-    Key(("?",), "?", "help", "These keys.", lambda ui, status: Step(replace(ui, help=True))),
-    Key(("q",), "q", "quit", "End the player.", lambda ui, status: Step(ui.said("ending"), quit=True)),
+    Key(("e",), "e", "e off", "Silence the selected stream, or let it speak again.", _enable),
+    Key(("f",), "f", "f fault", "Set a fault of the selected stream: `loss=5%`, `loss=none`.", _ask("fault")),
+    Key((":",), ":", ": any", "Anything that `pmu ctl` can do.", _ask("do")),
+    Key(("?",), "?", "? help", "These keys.", lambda ui, status: Step(replace(ui, help=True))),
+    Key(("q",), "q", "q quit", "End the player.", lambda ui, status: Step(ui.said("ending"), quit=True)),
 )
 _BY_NAME = {name: key for key in KEYS for name in key.names}
 

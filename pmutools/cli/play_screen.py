@@ -81,7 +81,7 @@ def _lines(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, 
         *filler,
         *events,
         _message(ui, status, width),
-        Text(help_line(width), DIM),
+        _help_line(width),
     ]
 
 
@@ -154,17 +154,23 @@ def _message(ui: Ui, status: PlayerStatus, width: int) -> Text:
     return Text.assemble((asked, BOLD), tail, (" ", SELECTED), "   " if ui.error else "", said)
 
 
-def help_line(width: int) -> str:
+def help_words(width: int) -> list[str]:
     """As many keys as fit; help and quit always."""
-    words = [f"{key.shown.split(' ')[0]} {key.label}" for key in KEYS if key.label]
-    last = words[-2:]
-    line = ""
-    for word in words[:-2]:
-        longer = f"{line}{word}  "
-        if len(longer) + len("  ".join(last)) > width:
-            break
-        line = longer
-    return line + "  ".join(last)
+    words = [key.label for key in KEYS if key.label]
+    while len(words) > 2 and len(" ".join(words)) > width:
+        del words[-3]
+    return words
+
+
+def _help_line(width: int) -> Text:
+    words = help_words(width)
+    gap = "  " if len("  ".join(words)) <= width else " "
+    line = Text()
+    for word in words:
+        key, _, label = word.partition(" ")
+        line.append(key, BOLD).append(f" {label}{gap}", DIM)
+    line.rstrip()
+    return line
 
 
 def _help(title: Title, width: int, height: int) -> list[Text]:

@@ -93,8 +93,8 @@ COLUMNS = (
     Column("faults", 0, lambda stream: visible(faults_text(stream.faults))),
 )
 """What is told of each stream. ``to`` counts who gets it; the counts are frames; delays are in µs."""
-_NAME = (8, 20)
-"""Narrowest and widest name."""
+_NAME = (8, 12, 20)
+"""Narrowest name, widest where faults have as much room, widest where they have twice as much."""
 
 
 class Layout(NamedTuple):
@@ -118,7 +118,7 @@ def layout(width: int) -> Layout:
     """The table of streams in ``width`` character cells."""
     columns = tuple(column for column in COLUMNS if width >= column.from_width)
     left = width - sum(column.width for column in columns) - len(columns) + 1
-    name = max(_NAME[0], min(_NAME[1], left // 2))
+    name = max(_NAME[0], min(_NAME[1], left // 2), min(_NAME[2], left // 3))
     rest = max(left - name, 6)
     widths = tuple(column.width or (name if column.title == "stream" else rest) for column in columns)
     return Layout(columns, widths)

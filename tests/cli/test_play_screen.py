@@ -10,7 +10,7 @@ from support.controlled import player_status, stream_status
 
 from pmutools.cli.play_display import picture
 from pmutools.cli.play_keys import KEYS, Prompt, Ui
-from pmutools.cli.play_screen import Title, help_line, page_rows
+from pmutools.cli.play_screen import Title, page_rows
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState
 
 TITLE = Title("cjb-8pmu.pcap", ("udp://127.0.0.1:4713", "tcp://0.0.0.0:4712"))
@@ -95,12 +95,13 @@ def test_events_messages_and_prompts() -> None:
 
 
 def test_the_help_line_is_made_of_the_keys() -> None:
-    assert help_line(80).startswith("SPACE pause  . step")
-    for width in range(40, 300):
-        line = help_line(width)
+    assert drawn(size=(200, 24))[-1] == "  ".join(key.label for key in KEYS if key.label)
+    for width in range(40, 200):
+        line = drawn(size=(width, 24))[-1]
         assert len(line) <= width
-        assert line.endswith("? help  q quit")
-    assert all(key.label in help_line(300) for key in KEYS)
+        assert line.startswith("SPACE pause")
+        assert line.split()[-4:] == ["?", "help", "q", "quit"]
+    assert "e off f fault" in drawn()[-1]
 
 
 def test_the_help_page_has_all_keys_at_80_by_24() -> None:
