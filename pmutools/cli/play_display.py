@@ -13,7 +13,7 @@ import select
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from types import FrameType
@@ -25,7 +25,7 @@ from rich.style import Style
 from rich.text import Text
 
 from pmutools.cli.play_keys import Ui, decode, foreseen, press
-from pmutools.cli.play_screen import Title, page_rows, render
+from pmutools.cli.play_screen import Title, lines, page_rows
 from pmutools.errors import PmuError, SettingsError
 from pmutools.impair.profile import Action
 from pmutools.net.reactor import READ, WRITE, Reactor, Timer
@@ -45,6 +45,9 @@ REACHED_S = 2.0
 LAST_WORDS_S = 0.2
 """How long a terminal may take to be set back."""
 READ_BYTES = 256
+LINES_A_TURN = 12
+"""Lines made at once, some 0.5 ms, before the player has its turn."""
+TURN_NS = 1_000_000
 
 _ENTER = b"\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J"
 _LEAVE = b"\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
@@ -173,6 +176,8 @@ class Display:
         self._seen_ns = self._as_of_ns = self._drawn_ns = -DRAW_NS
         self._dirty = True
         self._shown: list[str] = []
+        """Lines as they are on the screen, or in the queue for it."""
+        self._picture: Iterator[tuple[int, Text]] | None = None
         self._size = (0, 0)
         self._pending = b""
         self._escape: Timer | None = None
@@ -196,8 +201,7 @@ class Display:
         for timer in (self._tick, self._escape):
             if timer is not None:
                 timer.cancelled = True
-        self._reactor.forget(_Fd(self._terminal.keyboard))
-        self._reactor.forget(self._terminal)
+        self._leave()
         self._terminal.close()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -234,6 +238,7 @@ class Display:
         self._dirty = True
 
     def _leave(self) -> None:
+        self._picture = None
         self._reactor.forget(_Fd(self._terminal.keyboard))
         self._reactor.forget(self._terminal)
         self._terminal.leave()
@@ -344,9 +349,9 @@ class Display:
         return (to_s - from_s) / (last_s - first_s)
 
     def _draw(self) -> None:
-        """Make and write a picture, if one is due and the last one has been taken."""
+        """Begin a picture, if one is due and the last one has been taken."""
         now_ns = self._reactor.clock.monotonic_ns()
-        if self._gone or not self._terminal.entered or now_ns - self._drawn_ns < ECHO_NS:
+        if not self._terminal.entered or self._picture is not None or now_ns - self._drawn_ns < ECHO_NS:
             return
         status = self._look()
         size = self._terminal.size()
@@ -357,11 +362,26 @@ class Display:
             self._terminal.queue += b"\x1b[2J"
         self._drawn_ns, self._dirty = now_ns, False
         self.ui = replace(self.ui, rows=page_rows(size[1]))
-        lines = [self._terminal.ansi(line) for line in picture(status, self.ui, self._title, size, self._reached())]
-        for number, line in enumerate(lines):
-            if number >= len(self._shown) or self._shown[number] != line:
+        self._picture = enumerate(lines(status, self.ui, self._title, *size, self._reached()))
+        self._paint()
+
+    def _paint(self) -> None:
+        """Some more lines of the picture: those that differ from what is on the screen."""
+        if self._picture is None:
+            return
+        for _ in range(LINES_A_TURN):
+            number, made = next(self._picture, (0, None))
+            if made is None:
+                self._picture = None
+                break
+            line = self._terminal.ansi(made)
+            if number == len(self._shown):
+                self._shown.append("")
+            if self._shown[number] != line:
+                self._shown[number] = line
                 self._terminal.queue += f"\x1b[{number + 1};1H{line}\x1b[0m\x1b[K".encode()
-        self._shown = lines
+        if self._picture is not None:
+            self._reactor.call_in(TURN_NS, self._paint)
         self._on_writable(0)
 
     def _on_writable(self, _events: int) -> None:
@@ -374,13 +394,6 @@ class Display:
             self._reactor.watch(self._terminal, WRITE, self._on_writable)
         else:
             self._reactor.forget(self._terminal)
-
-
-def picture(
-    status: PlayerStatus, ui: Ui, title: Title, size: tuple[int, int], reached: float | None = None
-) -> list[Text]:
-    """The lines of :func:`render`."""
-    return [line for line in render(status, ui, title, *size, reached).renderables if isinstance(line, Text)]
 
 
 class _Fd:

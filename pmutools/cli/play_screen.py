@@ -5,6 +5,7 @@ Every line is a rich Text of its own, so that only lines that have changed need 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from rich.cells import cell_len
@@ -53,36 +54,50 @@ def page_rows(height: int) -> int:
 
 def render(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None = None) -> Group:
     """The screen: exactly ``height`` lines, none wider than ``width``. ``reached`` is the speed that was measured."""
+    return Group(*lines(status, ui, title, width, height, reached))
+
+
+def lines(
+    status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None = None
+) -> Iterator[Text]:
+    """The lines of :func:`render`, each made when it is asked for."""
     if width < SMALLEST[0] or height < SMALLEST[1]:
-        lines = [Text("too small: {}x{} needed".format(*SMALLEST))]
+        drawn = iter([Text("too small: {}x{} needed".format(*SMALLEST))])
     elif ui.help:
-        lines = _help(title, width, height)
+        drawn = iter(_help(title, width, height))
     else:
-        lines = _lines(status, ui, title, width, height, reached)
-    for line in lines:
+        drawn = _lines(status, ui, title, width, height, reached)
+    for _ in range(height):
+        line = next(drawn, None) or Text()
         if cell_len(line.plain) > width:
             line.truncate(width)
-    lines += [Text() for _ in range(height - len(lines))]
-    return Group(*lines[:height])
+        yield line
 
 
-def _lines(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None) -> list[Text]:
-    streams, footer = _streams(status, ui, width, page_rows(height))
-    space = height - (HEAD - 1) - len(streams) - FOOT
-    events = [Text(visible(event), DIM) for event in ui.events[-min(space, MORE_EVENTS) :]] if space else []
-    filler = [Text() for _ in range(space - len(events))]
-    return [
-        Text(fit(visible(f"pmu play {title}"), width), BOLD),
-        _state(status, reached),
-        _bar(status, ui, width),
-        _late(status, ui),
-        *streams,
-        footer,
-        *filler,
-        *events,
-        _message(ui, status, width),
-        _help_line(width),
-    ]
+def _lines(
+    status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None
+) -> Iterator[Text]:
+    rows = page_rows(height)
+    yield Text(fit(visible(f"pmu play {title}"), width), BOLD)
+    yield _state(status, reached)
+    yield _bar(status, ui, width)
+    yield _late(status, ui)
+    count = len(status.streams)
+    selected = min(ui.selected, count - 1)
+    top = max(selected, 0) // rows * rows
+    page = status.streams[top : top + rows]
+    table = layout(width)
+    yield Text(table.header(), HEADER)
+    for index, stream in enumerate(page, top):
+        style = SELECTED if index == selected else DIM if not stream.enabled else PLAIN
+        yield Text(table.row(stream), style)
+    yield _chosen(status, ui, f"{top + 1}-{top + len(page)} of {count}" if count > rows else f"{count} streams")
+    space = height - HEAD - len(page) - FOOT
+    events = ui.events[-min(space, MORE_EVENTS) :] if space else ()
+    yield from (Text() for _ in range(space - len(events)))
+    yield from (Text(visible(event), DIM) for event in events)
+    yield _message(ui, status, width)
+    yield _help_line(width)
 
 
 def _state(status: PlayerStatus, reached: float | None) -> Text:
@@ -124,21 +139,12 @@ def _late(status: PlayerStatus, ui: Ui) -> Text:
     return Text.assemble(text, (between + marked, MARK))
 
 
-def _streams(status: PlayerStatus, ui: Ui, width: int, rows: int) -> tuple[list[Text], Text]:
-    """The table's header and a page of it; and the line that tells of the selected stream."""
-    count = len(status.streams)
-    selected = min(ui.selected, count - 1)
-    top = max(selected, 0) // rows * rows
-    table = layout(width)
-    lines = [Text(table.header(), HEADER)]
-    for index, stream in enumerate(status.streams[top : top + rows], top):
-        style = SELECTED if index == selected else DIM if not stream.enabled else PLAIN
-        lines.append(Text(table.row(stream), style))
-    if (shown := chosen(ui, status)) is None:
-        return lines, Text("no streams", DIM)
-    where = f"{top + 1}-{min(top + rows, count)} of {count}" if count > rows else f"{count} streams"
-    faults = visible(faults_text(shown.faults)) or "no faults"
-    return lines, Text.assemble((f"{where}   ", DIM), (f"▸ {visible(shown.name)}", BOLD), f"  {faults}")
+def _chosen(status: PlayerStatus, ui: Ui, page: str) -> Text:
+    """Which streams the page shows, and the selected one's faults, whole."""
+    if (stream := chosen(ui, status)) is None:
+        return Text("no streams", DIM)
+    faults = visible(faults_text(stream.faults)) or "no faults"
+    return Text.assemble((f"{page}   ", DIM), (f"▸ {visible(stream.name)}", BOLD), f"  {faults}")
 
 
 def _message(ui: Ui, status: PlayerStatus, width: int) -> Text:

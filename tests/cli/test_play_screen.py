@@ -6,14 +6,19 @@ from dataclasses import replace
 
 import pytest
 from rich.cells import cell_len
+from rich.text import Text
 from support.controlled import player_status, stream_status
 
-from pmutools.cli.play_display import picture
 from pmutools.cli.play_keys import KEYS, Prompt, Ui
-from pmutools.cli.play_screen import Title, page_rows
+from pmutools.cli.play_screen import Title, page_rows, render
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState
 
 TITLE = Title("cjb-8pmu.pcap", ("udp://127.0.0.1:4713", "tcp://0.0.0.0:4712"))
+
+
+def picture(status: PlayerStatus, ui: Ui, size: tuple[int, int], reached: float | None = None) -> list[Text]:
+    made = render(status, ui, TITLE, *size, reached).renderables
+    return [line for line in made if isinstance(line, Text)]
 
 
 def drawn(
@@ -22,7 +27,7 @@ def drawn(
     size: tuple[int, int] = (80, 24),
     reached: float | None = None,
 ) -> list[str]:
-    lines = picture(status or player_status(), ui or Ui(), TITLE, size, reached)
+    lines = picture(status or player_status(), ui or Ui(), size, reached)
     return [line.plain for line in lines]
 
 
@@ -90,7 +95,7 @@ def test_events_messages_and_prompts() -> None:
     assert drawn(ui=ui)[-2].rstrip() == "fault of N2: loss=5"
     ui = replace(ui, message="5 is not a probability", error=True)
     assert " ".join(drawn(ui=ui)[-2].split()) == "fault of N2: loss=5 5 is not a probability"
-    error = picture(player_status(), ui, TITLE, (80, 24))[-2]
+    error = picture(player_status(), ui, (80, 24))[-2]
     assert any("red" in str(span.style) for span in error.spans)
 
 
