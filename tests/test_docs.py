@@ -40,7 +40,7 @@ INCOMPLETE = 3
 """Exit code of a command that found damage, which an example may want to show."""
 
 sys.path.insert(0, str(DOCS))
-from generate import GENERATORS  # noqa: E402
+from generate import GENERATORS, display  # noqa: E402
 from hooks import MARKER, filled  # noqa: E402
 
 
@@ -101,6 +101,13 @@ def test_images_are_small_and_there() -> None:
 def test_files_that_the_readme_links_to_are_there() -> None:
     for target in re.findall(r"\]\(([^)#]+)", PAGES["README.md"].read_text(encoding="utf-8")):
         assert target.startswith("http") or (ROOT / target).exists(), target
+
+
+def test_the_picture_of_the_player_is_what_its_code_draws() -> None:
+    kept, made = (
+        re.sub(r"<[^>]*>|\s", "", text) for text in (display.PICTURE.read_text(encoding="utf-8"), display.svg())
+    )
+    assert kept.partition("PLAYING")[2] == made.partition("PLAYING")[2], display.__doc__
 
 
 # --- examples ----------------------------------------------------------------------------------------------------

@@ -17,6 +17,8 @@ from pmutools.net.reactor import Reactor
 from pmutools.tools.player.control_address import parse_control_address
 from pmutools.tools.player.control_server import ControlServer
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture(autouse=True)
 def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ fcntl = pytest.importorskip("fcntl")
 from pmutools.cli.play_display import Display  # noqa: E402
 from pmutools.cli.play_screen import Title  # noqa: E402
 
+pytestmark = pytest.mark.realtime
 TITLE = Title("x.pcap", ("udp://127.0.0.1:4713",))
 ENVIRONMENT = {"TERM": "xterm", "LANG": "C.UTF-8"}
 MS = 1_000_000

@@ -90,11 +90,12 @@ class ControlServer:
         self._await_turn()
 
     def drop(self, client: _Client, why: str) -> None:
-        """Close a client's connection."""
+        """Close a client's connection; that it has left of itself (no ``why``) is nothing to tell."""
         if client in self._clients:
             self._clients.discard(client)
             client.close()
-            self._tell(f"control {client.name}: {why}")
+            if why:
+                self._tell(f"control {client.name}: {why}")
 
     def send_away(self, client: _Client, reason: str) -> None:
         """Close a client's connection, and tell it why if it listens."""
@@ -235,7 +236,7 @@ class _Client:
         except (BlockingIOError, InterruptedError):
             self._stuck_since_ns = self._stuck_since_ns or self._reactor.clock.monotonic_ns()
         except OSError as error:
-            self._server.drop(self, "disconnected" if error.errno == errno.EPIPE else str(explain(error, "gone")))
+            self._server.drop(self, "" if error.errno == errno.EPIPE else str(explain(error, "gone")))
             return
         self._arrange()
 
@@ -250,7 +251,7 @@ class _Client:
             self._watch(0)
             self._server.wants_turn(self)
         elif self._ended and session.due_ns is None:
-            self._server.drop(self, "disconnected")
+            self._server.drop(self, "")
         else:
             self._watch(0 if self._ended else READ)
             self._await_due(session.due_ns)
