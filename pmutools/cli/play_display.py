@@ -11,7 +11,6 @@ import io
 import os
 import select
 import signal
-import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -55,6 +54,14 @@ _PLAIN_TEXT = str.maketrans("━─●→←↑↓×…▸", "=-o><^vx~>")
 """For terminals that are not UTF-8."""
 
 
+def require_terminal(keyboard: int = 0, screen: int = 2, environment: Mapping[str, str] = os.environ) -> None:
+    """Raise SettingsError unless these descriptors are a terminal: to be asked before anything that takes long."""
+    if os.name != "posix":
+        raise SettingsError("--interactive needs a POSIX terminal; use --control and pmu ctl")
+    if not os.isatty(keyboard) or not os.isatty(screen) or environment.get("TERM", "dumb") in ("", "dumb"):
+        raise SettingsError("--interactive needs a terminal; use --control and pmu ctl")
+
+
 class Terminal:
     """A terminal in one-key-at-a-time mode and on its other screen, from :meth:`enter` to :meth:`leave`.
 
@@ -62,10 +69,7 @@ class Terminal:
     """
 
     def __init__(self, keyboard: int, screen: int, environment: Mapping[str, str]) -> None:
-        if os.name != "posix":
-            raise SettingsError("--interactive needs a POSIX terminal; use --control and pmu ctl")
-        if not os.isatty(keyboard) or not os.isatty(screen) or environment.get("TERM", "dumb") in ("", "dumb"):
-            raise SettingsError("--interactive needs a terminal; use --control and pmu ctl")
+        require_terminal(keyboard, screen, environment)
         import termios
 
         self.keyboard, self._screen = keyboard, screen
@@ -150,7 +154,8 @@ class Terminal:
 class Display:
     """The player on a terminal, from ``with`` to its end. Keys reach the player from within ``reactor``.
 
-    Raises SettingsError, before anything is changed, where there is no terminal.
+    Keys come from ``keyboard`` (standard input), the screen is ``screen`` (standard error, so that standard output is
+    data). Raises SettingsError, before anything is changed, where there is no terminal.
     """
 
     def __init__(
@@ -159,16 +164,12 @@ class Display:
         reactor: Reactor,
         title: Title,
         *,
-        keyboard: int | None = None,
-        screen: int | None = None,
+        keyboard: int = 0,
+        screen: int = 2,
         environment: Mapping[str, str] = os.environ,
     ) -> None:
         self._player, self._reactor, self._title = player, reactor, title
-        self._terminal = Terminal(
-            sys.stdin.fileno() if keyboard is None else keyboard,
-            sys.stderr.fileno() if screen is None else screen,
-            environment,
-        )
+        self._terminal = Terminal(keyboard, screen, environment)
         self.ui = Ui()
         self.quit = False
         """Whether the person, or a hang-up, asked for the end."""
