@@ -15,7 +15,7 @@ from pmutools.impair.profile import Action
 from pmutools.timebase import NS
 from pmutools.tools.player.control import BY_NAME, parse_control
 from pmutools.tools.player.status import PlayerStatus, PlayState, StreamStatus
-from pmutools.tools.window import parse_moment
+from pmutools.impair.verbs import Place
 
 EVENTS = 40
 """Events kept for the screen."""
@@ -219,8 +219,9 @@ def _entered(ui: Ui, prompt: Prompt, status: PlayerStatus) -> Step:
 def foreseen(status: PlayerStatus, action: Action) -> PlayerStatus:
     """The state once ``action`` is done, as far as it can be told without asking the player."""
     if action.verb == "seek":
-        moment = parse_moment(action.argument)
-        return replace(status, position_s=max(moment.ns / NS, 0.0)) if moment.relative else status
+        (place,) = action.values
+        known = isinstance(place, Place) and place.relative
+        return replace(status, position_s=place.ns / NS) if known else status
     if action.verb == "speed":
         return replace(status, speed=float(action.argument))
     return replace(status, state=PlayState.PLAYING) if action.verb == "resume" else status

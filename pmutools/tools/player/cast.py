@@ -103,12 +103,29 @@ class Cast:
 
     def between(self, low_ns: int, high_ns: int) -> Cut:
         """The frames at positions ``low_ns`` to below ``high_ns``."""
+        if not self._from_ns <= low_ns <= high_ns <= self._to_ns:
+            self._look_up(low_ns, high_ns)
         ahead = self._ahead
-        if not (self._from_ns <= low_ns and high_ns <= self._to_ns):
-            self._from_ns, self._to_ns = low_ns, max(high_ns, low_ns + AHEAD_NS)
-            ahead = self._ahead = self._cut(self._from_ns, self._to_ns)
         first, last = ahead.position_ns.searchsorted((low_ns, high_ns))
         return Cut(ahead.row[first:last], ahead.part[first:last], ahead.position_ns[first:last])
+
+    def next_position(self, low_ns: int) -> int | None:
+        """The position of the first frame at ``low_ns`` or later; None where there is none."""
+        due, zero_ns = self.reel.rows.due_ns, self.reel.first_due_ns
+        while True:
+            if not self._from_ns <= low_ns < self._to_ns:
+                self._look_up(low_ns, low_ns)
+            ahead = self._ahead.position_ns
+            if (place := int(ahead.searchsorted(low_ns))) < len(ahead):
+                return int(ahead[place])
+            row = int(due.searchsorted(zero_ns + self._to_ns - self._latest_ns))
+            if row == len(due):
+                return None
+            low_ns = max(self._to_ns, int(due[row]) - zero_ns)
+
+    def _look_up(self, low_ns: int, high_ns: int) -> None:
+        self._from_ns, self._to_ns = low_ns, max(high_ns, low_ns + AHEAD_NS)
+        self._ahead = self._cut(self._from_ns, self._to_ns)
 
     def _cut(self, low_ns: int, high_ns: int) -> Cut:
         due, zero_ns = self.reel.rows.due_ns, self.reel.first_due_ns
@@ -126,18 +143,6 @@ class Cast:
         kept = np.flatnonzero((position >= low_ns) & (position < high_ns))
         kept = kept[np.argsort(position[kept], kind="stable")]
         return Cut(rows[kept], parts[kept], position[kept])
-
-    def next_position(self, low_ns: int) -> int | None:
-        """The position of the first frame at ``low_ns`` or later; None where there is none."""
-        due, zero_ns = self.reel.rows.due_ns, self.reel.first_due_ns
-        while True:
-            position = self.between(low_ns, max(low_ns + 1, self._to_ns)).position_ns
-            if len(position):
-                return int(position[0])
-            first = int(due.searchsorted(zero_ns + max(low_ns + 1, self._to_ns) - self._latest_ns))
-            if first == len(due):
-                return None
-            low_ns = max(low_ns + 1, int(due[first]) - zero_ns)
 
     def config(self, part: int, edition: int) -> StreamConfig:
         """What ``part`` announces for data of ``edition``."""

@@ -22,15 +22,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
-from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
 
 from pmutools.errors import PmuError
 from pmutools.impair.profile import Action, parse_action
-from pmutools.parsers import integer, number, suggestion
+from pmutools.parsers import number, suggestion
 from pmutools.timebase import NS
 from pmutools.tools.player.status import PlayerStatus, StreamStatus
-from pmutools.tools.window import Moment, parse_moment
 
 PROTOCOL = 1
 LINE_BYTES = 64 << 10
@@ -62,42 +60,22 @@ class Controlled(Protocol):
 
 
 class Verb(NamedTuple):
-    """One thing to do: how it is written, what it means, and what reads its arguments (raises ValueError)."""
+    """One thing to do: how it is written, and what it means."""
 
     name: str
     arguments: str
     meaning: str
-    check: Callable[[str], object]
-    internal: bool = False
-    """Of the protocol itself, not of the player."""
+    check: Callable[[str], object] | None = None
+    """What reads the arguments (raises ValueError) of a verb of the protocol itself; all others are the player's."""
+
+    @property
+    def internal(self) -> bool:
+        """Whether it is the protocol's own, and never reaches the player."""
+        return self.check is not None
 
     @property
     def usage(self) -> str:
         return f"{self.name} {self.arguments}".rstrip()
-
-
-def parse_step(text: str) -> int:
-    """How many frame instants to step: ``N``, or one."""
-    return integer(1, 1_000_000)(text) if text else 1
-
-
-def parse_speed(text: str) -> Fraction:
-    """A speed, exactly as written."""
-    number(0.001, 1000)(text)
-    return Fraction(text.strip())
-
-
-def parse_between(text: str) -> tuple[Moment, Moment] | None:
-    """``A B``, two times of the source, or None for ``off``."""
-    if text.strip().lower() == "off":
-        return None
-    words = text.split()
-    if len(words) != 2:
-        raise ValueError("write 'loop A B' (seconds into the source, or UTC) or 'loop off'")
-    start, end = parse_moment(words[0]), parse_moment(words[1])
-    if start.relative == end.relative and start.ns >= end.ns:
-        raise ValueError(f"A is not before B; write 'loop {words[1]} {words[0]}'" if start.ns > end.ns else "A is B")
-    return start, end
 
 
 def parse_every(text: str) -> int:
@@ -110,24 +88,22 @@ def _nothing(text: str) -> None:
         raise ValueError(f"takes no argument; leave out {text!r}")
 
 
-def _grammar(text: str) -> None:
-    """Read by :func:`parse_action` already."""
-
-
 VERBS = (
-    Verb("pause", "", "Stop the source's time where it is; clients stay connected.", _nothing),
-    Verb("resume", "", "Go on from there.", _nothing),
-    Verb("step", "[N]", "While paused: the next frame instant of all streams, or the next N.", parse_step),
-    Verb("seek", "T", "Go on at T: seconds into the source, or UTC.", parse_moment),
-    Verb("speed", "X", "Source seconds per second, 0.001 to 1000.", parse_speed),
-    Verb("loop", "A B | off", "Play from A to B over and over; `off` ends it.", parse_between),
-    Verb("enable", "NAME", "Let these streams (a name, an IDCODE, a pattern) speak.", _grammar),
-    Verb("disable", "NAME", "Silence these streams until they are enabled.", _grammar),
-    Verb("fault", "NAME OPTION=VALUE", "Set a fault of these streams, as in a profile; `none` ends it.", _grammar),
-    Verb("stats", "", "What the player is doing: the answer's `result`.", _nothing, True),
-    Verb("watch", "[S]", "Send that every S (or `every_s`) seconds from now on, 1 if not said.", parse_every, True),
-    Verb("unwatch", "", "No longer.", _nothing, True),
-    Verb("help", "", "These verbs.", _nothing, True),
+    Verb(
+        "pause", "[S]", "Stop the source's time where it is, for S seconds or until `resume`; clients stay connected."
+    ),
+    Verb("resume", "", "Go on from there."),
+    Verb("step", "[N]", "While paused: the next frame instant of all streams, or the next N."),
+    Verb("seek", "T", "Go on at T: seconds into the source, or UTC."),
+    Verb("speed", "X", "Source seconds per second, 0.001 to 1000."),
+    Verb("loop", "A B | off", "Play from A to B over and over; `off` ends it."),
+    Verb("enable", "NAME", "Let these streams (a name, an IDCODE, a pattern) speak."),
+    Verb("disable", "NAME", "Silence these streams until they are enabled."),
+    Verb("fault", "NAME OPTION=VALUE", "Set a fault of these streams, as in a profile; `none` ends it."),
+    Verb("stats", "", "What the player is doing: the answer's `result`.", _nothing),
+    Verb("watch", "[S]", "Send that every S (or `every_s`) seconds from now on, 1 if not said.", parse_every),
+    Verb("unwatch", "", "No longer.", _nothing),
+    Verb("help", "", "These verbs.", _nothing),
 )
 BY_NAME = {verb.name: verb for verb in VERBS}
 
@@ -140,11 +116,13 @@ def parse_control(text: str) -> Action:
     verb = BY_NAME.get(name.lower())
     if verb is None:
         raise ValueError(f"{name[:32]!r} is nothing to do; {suggestion(name.lower()[:32], BY_NAME)}")
+    if verb.check is None:
+        return parse_action(text)
     try:
         verb.check(argument.strip())
     except ValueError as error:
         raise ValueError(f"{verb.usage}: {error}") from None
-    return Action(verb.name, argument=argument.strip()) if verb.internal else parse_action(text)
+    return Action(verb.name, argument=argument.strip())
 
 
 # --- the status as JSON, in portions -----------------------------------------------------------------------------

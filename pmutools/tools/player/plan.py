@@ -21,7 +21,8 @@ from pmutools import timebase
 from pmutools.flow import Hangup
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
-from pmutools.impair.profile import Action, Place
+from pmutools.impair.profile import Action
+from pmutools.impair.verbs import Place
 from pmutools.pacing import Playback
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
