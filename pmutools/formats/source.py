@@ -206,7 +206,9 @@ class Gatherer:
             yield run.block(flow)
 
 
-def gather(items: Iterable[Message | Loss | DataRun], frames: int = BLOCK_FRAMES) -> Iterator[Block | Message | Loss]:
+def gather(
+    items: Iterable[Block | Message | Loss | DataRun], frames: int = BLOCK_FRAMES
+) -> Iterator[Block | Message | Loss]:
     """Data messages gathered into blocks of up to ``frames``; everything else passes through."""
     gatherer = Gatherer(frames)
     data = FrameType.DATA
