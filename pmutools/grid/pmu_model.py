@@ -9,7 +9,10 @@ import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from pmutools.draws import normal
 from pmutools.grid.signals import Bus
@@ -78,6 +81,30 @@ def measure(
         frequency_hz=nominal_hz + pmu.swing * bus.deviation_hz,
         rocof_hz_s=pmu.swing * bus.rocof_hz_s,
     )
+
+
+def measured_columns(
+    pmu: PmuModel, course: npt.NDArray[np.float64], slots: range, *, nominal_hz: float = 60.0
+) -> tuple[npt.NDArray[Any], ...]:
+    """:func:`measure` over N reporting instants ``slots``, at which the bus shows ``course`` (N, 4): a column a value.
+
+    The columns are those of :class:`Measurement` from ``va`` on, each (N,), but for the last bit of a float.
+    """
+    turned, deviation_hz, rocof_hz_s, voltage_pu = course.T
+    angle = pmu.angle_rad + pmu.swing * turned
+    magnitude = voltage_pu * pmu.nominal_kv * 1e3 / math.sqrt(3)
+    if pmu.noise_rad:
+        angle = angle + pmu.noise_rad * _draws(pmu, "angle", slots)
+    if pmu.noise_pu:
+        magnitude = magnitude * (1 + pmu.noise_pu * _draws(pmu, "magnitude", slots))
+    v1 = magnitude * np.exp(1j * angle)
+    i1 = pmu.current_a * np.exp(1j * (angle - 0.2))
+    phases = (v1 * turn for turn in _ROTATE)
+    return (*phases, v1, i1, nominal_hz + pmu.swing * deviation_hz, pmu.swing * rocof_hz_s)
+
+
+def _draws(pmu: PmuModel, stage: str, slots: range) -> npt.NDArray[np.float64]:
+    return np.array([normal(pmu.seed, str(pmu.idcode), stage, slot) for slot in slots])
 
 
 _SWINGS: Final = (1.0, 0.97, 1.03, 0.95)
