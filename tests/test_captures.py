@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -24,12 +25,19 @@ COMMANDS = {
     for line in re.findall(r"^\$ (pmu synth .+)$", README, re.M)
     if (words := shlex.split(line))
 }
+SCRIPTED = {
+    Path(words[2]).with_suffix(suffix).name: words[1:]
+    for line in re.findall(r"^\$ (python .+\.cfg)$", README, re.M)
+    if (words := shlex.split(line))
+    for suffix in (".cfg", ".dat")
+}
+"""COMTRADE: a script writes two files."""
 LIMIT_BYTES = 4 << 20
 
 
 def test_every_file_is_listed_and_has_its_command() -> None:
     there = {path.name for path in CAPTURES.iterdir()} - {"README.md"}
-    assert there == LISTED.keys() == COMMANDS.keys()
+    assert there == LISTED.keys() == COMMANDS.keys() | SCRIPTED.keys()
     assert sum(size for size, _ in LISTED.values()) < LIMIT_BYTES
 
 
@@ -48,9 +56,19 @@ def rebuilt(name: str, folder: Path) -> Path:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the last bit of sin, cos and exp is the C library's")
-@pytest.mark.parametrize("name", [name for name in LISTED if not name.endswith(".parquet")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if not name.endswith(".parquet")])
 def test_the_command_makes_the_same_bytes(name: str, tmp_path: Path) -> None:
     assert rebuilt(name, tmp_path).read_bytes() == (CAPTURES / name).read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the last bit of cos is the C library's")
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_the_script_makes_the_same_bytes(name: str, tmp_path: Path) -> None:
+    script, output = SCRIPTED[name]
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    subprocess.run([sys.executable, str(CAPTURES.parent / script), output], cwd=tmp_path, check=True, timeout=60)
+    assert (folder / name).read_bytes() == (CAPTURES / name).read_bytes()
 
 
 @pytest.mark.parametrize("name", [name for name in LISTED if name.endswith(".parquet")])

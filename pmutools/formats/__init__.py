@@ -4,7 +4,8 @@ A file is opened by its content where that is unmistakable (the magic numbers of
 through), else by its suffix; a folder is the files in it, merged on time. What is written follows the suffix.
 
 A new format is a module with ``read(path, configs) -> Source`` and, if it is written, ``create(path, options) ->
-Sink``, and its row in :data:`FORMATS`. Modules are imported when a file of theirs is opened.
+Sink``, and its row in :data:`FORMATS`. Where it may lack a configuration, the row says ``inferred`` and ``read`` takes
+a third argument, :class:`Nominal`. Modules are imported when a file of theirs is opened.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
     from pmutools.formats.source import Source
 
-__all__ = ["FORMATS", "FileFormat", "Sink", "SinkOptions", "open_sink", "open_source"]
+__all__ = ["FORMATS", "UNSAID", "FileFormat", "Nominal", "Sink", "SinkOptions", "open_sink", "open_source"]
 
 COMPRESSIONS = (".gz", ".zst")
 _COMPRESSED = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 
 
 class FileFormat(NamedTuple):
-    """One kind of file: its suffixes, its module, the bytes it may begin with, and whether it may be compressed."""
+    """One kind of file: its suffixes, its module, the bytes it may begin with, and whether it may be compressed.
+
+    ``inferred`` says that its configuration may have to be inferred.
+    """
 
     kind: str
     suffixes: tuple[str, ...]
@@ -36,8 +40,26 @@ class FileFormat(NamedTuple):
     magics: tuple[bytes, ...] = ()
     compressible: bool = False
     written: bool = True
+    inferred: bool = False
 
 
+class Nominal(NamedTuple):
+    """What the user says of a recording that does not say it: DATA_RATE and nominal frequency; None: infer it."""
+
+    data_rate: int | None = None
+    fnom_hz: float | None = None
+
+    @property
+    def given(self) -> bool:
+        return self != (None, None)
+
+    def refuse(self, path: Path) -> None:
+        """Raises SettingsError where something was given for a recording that brings its configuration."""
+        if self.given:
+            raise SettingsError(f"{path} brings its configuration: no rate or nominal frequency can be chosen for it")
+
+
+UNSAID = Nominal()
 _PCAP_MAGICS = tuple(
     bytes.fromhex(magic) for magic in ("a1b2c3d4", "d4c3b2a1", "a1b23c4d", "4d3cb2a1", "a1b2cd34", "34cdb2a1")
 )
@@ -47,35 +69,51 @@ FORMATS = (
     FileFormat("pcap", (".pcap",), "pcap", _PCAP_MAGICS, compressible=True),
     FileFormat("pcapng", (".pcapng",), "pcap", (b"\n\r\r\n",), compressible=True),
     FileFormat("mcap", (".mcap",), "mcap", (b"\x89MCAP0\r\n",)),
-    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",)),
-    FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",)),
+    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",), inferred=True),
+    FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",), inferred=True),
     FileFormat("raw", (".c37118", ".pmucapture"), "raw", _FRAME_MAGICS, compressible=True),
-    FileFormat("csv", (".csv",), "csv", compressible=True),
+    FileFormat("csv", (".csv",), "csv", compressible=True, inferred=True),
+    FileFormat("comtrade", (".cfg", ".dat", ".cff"), "comtrade", written=False, inferred=True),
 )
 
 
-def open_source(path: str | Path, *, configs: Iterable[StreamConfig] = ()) -> Source:
+def open_source(
+    path: str | Path,
+    *,
+    configs: Iterable[StreamConfig] = (),
+    data_rate: int | None = None,
+    fnom_hz: float | None = None,
+) -> Source:
     """Open a recording, or a folder of them, for reading once.
 
-    ``configs`` are used for streams that the recording has no configuration of.
+    ``configs`` are used for streams that the recording has no configuration of. ``data_rate`` (> 0 frames/s, < 0
+    seconds a frame) and ``fnom_hz`` (50 or 60) are what such streams are taken to have; None: what their numbers show.
 
     Raises
     ------
     SourceError
         The file cannot be read, is empty, or is not what its content or suffix promises.
     SettingsError
-        Neither content nor suffix tells what it is.
+        Neither content nor suffix tells what it is; a rate is chosen for a recording that has one.
     """
-    path = Path(path)
+    path, nominal = Path(path), Nominal(data_rate, fnom_hz)
+    if data_rate is not None and not (0 < abs(data_rate) <= 0x7FFF):
+        raise SettingsError(f"DATA_RATE {data_rate}: 1 to 32767 frames a second, or -1 to -32767 for seconds a frame")
+    if fnom_hz is not None and fnom_hz not in (50, 60):
+        raise SettingsError(f"nominal frequency {fnom_hz:g} Hz: C37.118 knows 50 and 60")
     if path.is_dir():
-        return _open_folder(path, configs)
+        return _open_folder(path, configs, nominal)
     head, compressed = _head(path)
     form = _by_content(head) or _by_suffix(path)
     if form is None:
         raise SettingsError(f"{path} is of no known format; known are {known_suffixes()}")
     if compressed and not form.compressible:
         raise SourceError(f"{path} is a compressed {form.kind} file, which is not read; unpack it first")
-    return cast("Source", import_module(f"{__name__}.{form.module}").read(path, configs))
+    module = import_module(f"{__name__}.{form.module}")
+    if form.inferred:
+        return cast("Source", module.read(path, configs, nominal))
+    nominal.refuse(path)
+    return cast("Source", module.read(path, configs))
 
 
 def open_sink(path: str | Path, *, phasors: Literal["polar", "rect"] = "polar", long: bool = False) -> Sink:
@@ -130,11 +168,17 @@ def _head(path: Path) -> tuple[bytes, bool]:
             return window.data[:16], file.read(4).startswith(_COMPRESSED)
 
 
-def _open_folder(path: Path, configs: Iterable[StreamConfig]) -> Source:
+def _open_folder(path: Path, configs: Iterable[StreamConfig], nominal: Nominal) -> Source:
     from pmutools.formats.folder import MergedSource
 
     known = tuple(configs)
-    files = sorted(file for file in path.iterdir() if file.is_file() and _by_suffix(file))
+    files = sorted(file for file in path.iterdir() if file.is_file() and _by_suffix(file) and not _is_second(file))
     if not files:
         raise SourceError(f"{path} is a folder without recordings; name a file, or a folder of {known_suffixes()}")
-    return MergedSource(path, "folder", [open_source(file, configs=known) for file in files])
+    sources = [open_source(file, configs=known, data_rate=nominal.data_rate, fnom_hz=nominal.fnom_hz) for file in files]
+    return MergedSource(path, "folder", sources)
+
+
+def _is_second(path: Path) -> bool:
+    """Whether a file is the data of a COMTRADE record, whose header stands for both."""
+    return path.suffix.lower() == ".dat"

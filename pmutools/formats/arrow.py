@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pmutools.c37118.config import StreamConfig
+from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.files import OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource
@@ -19,7 +20,7 @@ _FRAME = 8
 """A file is its magic, padded to this, then a stream, then a footer that is not needed to read on."""
 
 
-def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
+def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a table, one record batch in memory at a time."""
     import pyarrow as pa
 
@@ -36,7 +37,7 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
                 except (OSError, ValueError, pa.ArrowException):
                     defects["table without an end"] = 1
 
-        return arrow_source(path, "arrow", stream.schema, parts(), configs, defects)
+        return arrow_source(path, "arrow", stream.schema, parts(), configs, defects, nominal)
 
 
 class ArrowRows:

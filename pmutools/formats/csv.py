@@ -21,7 +21,7 @@ import numpy.typing as npt
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.config import StreamConfig
 from pmutools.errors import SourceError
-from pmutools.formats import ieee_csv
+from pmutools.formats import UNSAID, Nominal, ieee_csv
 from pmutools.formats.columns import FrameValues, unique
 from pmutools.formats.files import OutputFile, TextTable, without_blank_end
 from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
@@ -33,7 +33,7 @@ from pmutools.formats.table_sink import TableSink
 TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 
 
-def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
+def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a CSV of either layout. Raises SourceError where its header or first rows say that it is neither."""
     text = TextTable(path)
     header, second = text.row(), text.row()
@@ -41,14 +41,14 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
         raise SourceError(f"{path} is empty; name another file")
     if second is not None:
         if ieee_csv.is_kinds(second):
-            return ieee_csv.read_rows(text, header, second)
+            return ieee_csv.read_rows(text, header, second, nominal)
         text.put_back(second)
     names = unique(without_blank_end(header))
     if set(LONG_COLUMNS) <= set(names):
         raise SourceError(f"{path} is a table in long form, which cannot be played back; write it without --long")
     if "time" not in names and "time_ns" not in names:
         raise SourceError(f"{path}:1: no column time or time_ns; name the columns in the first row")
-    return table_source(path, "csv", names, _rows(text, names), configs=configs, defects=text.defects)
+    return table_source(path, "csv", names, _rows(text, names), configs=configs, defects=text.defects, nominal=nominal)
 
 
 def _rows(text: TextTable, names: list[str]) -> Iterator[Rows]:

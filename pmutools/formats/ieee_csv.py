@@ -33,6 +33,7 @@ import numpy.typing as npt
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME
 from pmutools.errors import SourceError
+from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.columns import Column, FrameValues, unique
 from pmutools.formats.files import END_NS, TextTable, without_blank_end
 from pmutools.formats.infer import data_rate_of, infer, nominal_hz_of
@@ -88,7 +89,7 @@ def is_kinds(row: Sequence[str]) -> bool:
     return len(row) > 1 and row[0].upper() == "T"
 
 
-def read_rows(text: TextTable, names: Sequence[str], kinds: Sequence[str]) -> TableSource:
+def read_rows(text: TextTable, names: Sequence[str], kinds: Sequence[str], nominal: Nominal = UNSAID) -> TableSource:
     """The source of a file whose first two rows have been read.
 
     Raises SourceError, with the line, for units that are not known and for a file without rows of numbers.
@@ -114,10 +115,10 @@ def read_rows(text: TextTable, names: Sequence[str], kinds: Sequence[str]) -> Ta
     if first is None:
         raise SourceError(f"{text.path}: no rows of numbers after the header; name another file")
     columns = _columns(heads)
-    rate = data_rate_of(first.frames.time_ns)
-    rows.refer_to_nominal(first, nominal_hz_of(np.empty(0), rate))
+    rate = nominal.data_rate or data_rate_of(first.frames.time_ns)
+    rows.refer_to_nominal(first, nominal.fnom_hz or nominal_hz_of(np.empty(0), rate))
     frequencies = [rows.values(first, head) for head in heads if head.quantity == "freq_hz"]
-    fnom_hz = nominal_hz_of(np.concatenate(frequencies) if frequencies else np.empty(0), rate)
+    fnom_hz = nominal.fnom_hz or nominal_hz_of(np.concatenate(frequencies) if frequencies else np.empty(0), rate)
     try:
         plan = infer(columns, idcode=NO_IDCODE, data_rate=rate or round(fnom_hz), fnom_hz=fnom_hz)
     except SourceError as error:

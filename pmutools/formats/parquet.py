@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pmutools.c37118.config import StreamConfig
+from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.files import OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import BLOCK_FRAMES, TableSource
@@ -25,7 +26,7 @@ _MIN_ROWS = 1 << 12
 """Row groups smaller than this cost more than they hold: their time does not count."""
 
 
-def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
+def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a table; memory is bounded by one of its row groups."""
     from pyarrow import parquet
 
@@ -36,7 +37,7 @@ def read(path: Path, configs: Iterable[StreamConfig] = ()) -> TableSource:
             with reading(path, "Parquet"), file:
                 yield from file.iter_batches(BLOCK_FRAMES)
 
-        return arrow_source(path, "parquet", file.schema_arrow, parts(), configs)
+        return arrow_source(path, "parquet", file.schema_arrow, parts(), configs, nominal=nominal)
 
 
 class ParquetRows:

@@ -16,6 +16,7 @@ from pmutools.c37118.batch import STAMP_SOURCES, Batch
 from pmutools.c37118.config import StreamConfig
 from pmutools.errors import SourceError
 from pmutools.flow import Flow, StampSource
+from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.columns import FrameValues, Phasors, batch_of, columns_of
 from pmutools.formats.infer import Plan, columns_from_names, data_rate_of, infer, nominal_hz_of
 from pmutools.formats.source import Block, TableSource
@@ -42,10 +43,12 @@ def table_source(
     own: StreamConfig | None = None,
     configs: Iterable[StreamConfig] = (),
     defects: Counter[str] | None = None,
+    nominal: Nominal = UNSAID,
 ) -> TableSource:
     """A source of a file's rows. ``own`` is the configuration in the file, ``configs`` are those known beforehand.
 
-    Without any that fits the columns, one is inferred from the first rows. Raises SourceError where there are none.
+    Without any that fits the columns, one is inferred from the first rows, but for what ``nominal`` says. Raises
+    SourceError where there are none, SettingsError where ``nominal`` says something of a known configuration.
     """
     walk = iter(rows)
     first = next(walk, None)
@@ -55,8 +58,10 @@ def table_source(
     plan = _known(names, [own] if own else []) or _known(
         names, [config for config in configs if config.idcode == int(first.idcode[0])]
     )
+    if plan is not None:
+        nominal.refuse(path)
     try:
-        plan = plan or _inferred(names, first, path)
+        plan = plan or _inferred(names, first, path, nominal)
     except SourceError as error:
         raise SourceError(f"{path}: {error}") from None
     return planned_source(path, kind, plan, chain([first], walk), defects)
@@ -81,12 +86,12 @@ def _known(names: Sequence[str], configs: Iterable[StreamConfig]) -> Plan | None
     return None
 
 
-def _inferred(names: Sequence[str], first: Rows, path: Path) -> Plan:
+def _inferred(names: Sequence[str], first: Rows, path: Path, nominal: Nominal) -> Plan:
     columns = columns_from_names(names, path.name.partition(".")[0])
-    rate = data_rate_of(first.frames.time_ns)
+    rate = nominal.data_rate or data_rate_of(first.frames.time_ns)
     frequencies = [first.values(column.name) for column in columns if column.quantity == "freq_hz"]
     given = [values for values in frequencies if values is not None]
-    fnom_hz = nominal_hz_of(np.concatenate(given) if given else np.empty(0), rate)
+    fnom_hz = nominal.fnom_hz or nominal_hz_of(np.concatenate(given) if given else np.empty(0), rate)
     return infer(columns, idcode=int(first.idcode[0]), data_rate=rate or round(fnom_hz), fnom_hz=fnom_hz)
 
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch
 from pmutools.c37118.config import StreamConfig, decode_config, encode_config
 from pmutools.errors import SourceError, WireError
+from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.columns import INTEGERS, FrameValues, Phasors, columns_of, quantities
 from pmutools.formats.files import END_NS
 from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
@@ -145,6 +146,7 @@ def arrow_source(
     parts: Iterable[Any],
     configs: Iterable[StreamConfig] = (),
     defects: Counter[str] | None = None,
+    nominal: Nominal = UNSAID,
 ) -> TableSource:
     """A source of Arrow record batches of ``schema``.
 
@@ -158,7 +160,7 @@ def arrow_source(
     counts = Counter[str]() if defects is None else defects
     own = _config_in(schema.metadata or {}, path)
     rows = _rows(parts, counts)
-    return table_source(path, kind, names, rows, own=own, configs=configs, defects=counts)
+    return table_source(path, kind, names, rows, own=own, configs=configs, defects=counts, nominal=nominal)
 
 
 def _config_in(metadata: dict[bytes, bytes], path: Path) -> StreamConfig | None:
