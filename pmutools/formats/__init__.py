@@ -73,6 +73,7 @@ FORMATS = (
     FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",), inferred=True),
     FileFormat("raw", (".c37118", ".pmucapture"), "raw", _FRAME_MAGICS, compressible=True),
     FileFormat("csv", (".csv",), "csv", compressible=True, inferred=True),
+    FileFormat("jsonl", (".jsonl",), "jsonl", compressible=True, written=False, inferred=True),
     FileFormat("comtrade", (".cfg", ".dat", ".cff"), "comtrade", written=False, inferred=True),
 )
 

@@ -119,7 +119,7 @@ def _compressed(raw: IO[bytes], suffix: str) -> Any:
     return raw
 
 
-class _WindowFile(io.RawIOBase):
+class WindowFile(io.RawIOBase):
     """A :class:`Window` as a file to read from."""
 
     def __init__(self, window: Window) -> None:
@@ -150,7 +150,7 @@ class TextTable:
         self.defects = Counter[str]()
         self._window = Window(path)
         text = io.TextIOWrapper(
-            io.BufferedReader(_WindowFile(self._window), 1 << 16), "utf-8-sig", errors="replace", newline=""
+            io.BufferedReader(WindowFile(self._window), 1 << 16), "utf-8-sig", errors="replace", newline=""
         )
         self._reader = csv.reader(text)
         self._again: list[list[str]] = []
