@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch
 from pmutools.c37118.config import StreamConfig, decode_config, encode_config
-from pmutools.errors import SourceError, WireError
+from pmutools.errors import PmuError, SourceError, WireError
 from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.columns import INTEGERS, FrameValues, Phasors, columns_of, quantities
 from pmutools.formats.files import END_NS
@@ -132,7 +132,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
 
     try:
         yield
-    except SourceError:
+    except PmuError:
         raise
     except (OSError, ValueError, pa.ArrowException) as error:
         reason = str(error).partition("\n")[0].rstrip(".")
