@@ -269,6 +269,8 @@ def _record(path: Path, text: str, data: bytes, named: str, defects: Counter[str
         raise SourceError(f"{path} holds no samples; name another file")
     loaded, count = _loaded(head, cfg, rows, count, cells, defects)
     times_s = np.asarray(loaded.time, np.float64)
+    if -np.inf < times_s[0] < 0:  # a recorder that counts its samples from 0
+        times_s = times_s - times_s[0]
     good = np.isfinite(times_s) & (times_s >= 0) & (times_s < 366 * 86400)
     good[good] = _rising(times_s[good])
     if not good.all():

@@ -196,6 +196,16 @@ def test_stamped_samples_and_a_gap(tmp_path: Path) -> None:
     assert defects == {"samples missing at the end": 100}
 
 
+def test_samples_counted_from_zero(tmp_path: Path) -> None:
+    path = Recording([Analog("V", wave(100, 30))], rates=((1000, 500),)).write(tmp_path / "a.cfg")
+    data = path.with_suffix(".dat")
+    rows = [line.split(",", 1) for line in data.read_text().splitlines()]
+    data.write_text("\n".join(f"{int(number) - 1},{rest}" for number, rest in rows))
+    batch, defects = opened(path)
+    assert defects == {}
+    assert tve(batch.phasors[:, 0], truth(batch, 100, 30, 50)) < 0.01
+
+
 def test_missing_samples_are_no_numbers(tmp_path: Path) -> None:
     def holed(at: float) -> float:
         return math.nan if 0.2 < at < 0.21 else wave(100, 0)(at)
