@@ -77,7 +77,7 @@ def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UN
     """
     record = read_record(path)
     channels = [_channel(record, number) for number in range(len(record.analogs))]
-    if _has_pairs(channels) or _usual_rate(record) <= MAX_RATE:
+    if _has_pairs(channels) or _highest_rate(record) <= MAX_RATE:
         return _phasor_source(path, record, channels, nominal)
     return _waveform_source(path, record, nominal)
 
@@ -91,10 +91,9 @@ def _has_pairs(channels: Sequence[_Channel]) -> bool:
     return bool(names["mag"] & names["deg"] or names["re"] & names["im"])
 
 
-def _usual_rate(record: Record) -> float:
-    """Samples/s, of most of them."""
-    steps = np.diff(record.times_s)
-    return 1 / float(np.median(steps)) if len(steps) else 0.0
+def _highest_rate(record: Record) -> float:
+    """Samples/s of the fastest stretch of more than two."""
+    return max((part.rate_hz for part in record.stretches if part.last - part.first > 2), default=0.0)
 
 
 # --- records of phasors -----------------------------------------------------------------------------------------
@@ -423,16 +422,18 @@ def _waveform_source(path: Path, record: Record, nominal: Nominal) -> TableSourc
 
 def _instants(record: Record, rate: int, nominal_hz: float) -> Iterator[npt.NDArray[np.int64]]:
     """Reporting instants (UTC ns) whose windows lie wholly within evenly spaced samples, stretch by stretch."""
-    first, last = (record.start_ns + round(float(at) * NS) for at in record.times_s[[0, -1]])
-    grid_ns = _grid_ns(np.arange(first * rate // NS, last * rate // NS + 2), rate)
-    since_s = (grid_ns - record.start_ns).astype(np.float64) * 1e-9
-    good = [part for part in record.stretches if part.rate_hz >= MIN_SAMPLES_PER_CYCLE * nominal_hz]
-    slow = sum(part.last - part.first for part in record.stretches if part not in good and part.last - part.first > 2)
+    least_hz = MIN_SAMPLES_PER_CYCLE * nominal_hz
+    good = [part for part in record.stretches if part.rate_hz >= least_hz]
+    counts = [part.last - part.first for part in record.stretches if part.rate_hz < least_hz]
+    slow = sum(count for count in counts if count > 2)  # two are the ends of a gap
     if slow:
         record.defects[f"samples fewer than {MIN_SAMPLES_PER_CYCLE} a cycle"] = slow
     for part in good:
-        bounds_s = float(record.times_s[part.first]), float(record.times_s[part.last - 1])
-        yield grid_ns[whole_windows(since_s, *bounds_s, nominal_hz)]
+        first_s, last_s = float(record.times_s[part.first]), float(record.times_s[part.last - 1])
+        first, last = (record.start_ns + round(at_s * NS) for at_s in (first_s, last_s))
+        grid_ns = _grid_ns(np.arange(first * rate // NS, last * rate // NS + 2), rate)
+        since_s = (grid_ns - record.start_ns).astype(np.float64) * 1e-9
+        yield grid_ns[whole_windows(since_s, first_s, last_s, nominal_hz)]
 
 
 def _grid_ns(slots: npt.NDArray[np.int64], rate: int) -> npt.NDArray[np.int64]:
@@ -469,7 +470,8 @@ class _Estimator:
         whole_ns = self._record.start_ns // NS * NS
         instants_s = (instants_ns - whole_ns).astype(np.float64) * 1e-9
         for piece, about in windows(self._times_s, instants_s, self._nominal_hz):
-            values = self._phasor_values(about)
+            with np.errstate(all="ignore"):  # a file of floats may hold any
+                values = self._phasor_values(about)
             at = np.searchsorted(self._times_s, instants_s[piece] + 1e-9, side="right") - 1
             values |= {name: column[at] for name, column in words.values.items()}
             for number, analog in enumerate(self._others):
@@ -508,4 +510,4 @@ class _Estimator:
 
 def _strength(wave: _Wave) -> float:
     finite = wave.analog.values[np.isfinite(wave.analog.values)]
-    return float(np.sqrt(np.mean(np.square(finite)))) * wave.scale if len(finite) else 0.0
+    return float(np.abs(finite).mean()) * wave.scale if len(finite) else 0.0

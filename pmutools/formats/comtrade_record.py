@@ -100,13 +100,15 @@ def read_record(path: Path) -> Record:
     SourceError
         The other file is missing, the header cannot be understood, or there are no samples.
     """
+    from comtrade import ComtradeError
+
     text, data, named = _parts(path)
     defects = Counter[str]()
     try:
         return _record(path, text, data, named, defects)
     except SourceError:
         raise
-    except _DAMAGE as error:
+    except (*_DAMAGE, ComtradeError) as error:
         reason = (str(error).partition("\n")[0] or type(error).__name__)[:100]
         raise SourceError(f"{path} is no readable COMTRADE record ({reason}); export it again") from None
 

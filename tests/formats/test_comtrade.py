@@ -405,6 +405,21 @@ def test_what_cannot_be_read_is_one_line(
     assert str(tmp_path) in str(raised.value)
 
 
+def test_samples_that_are_hours_apart_cost_nothing(tmp_path: Path) -> None:
+    """Instants are sought where there are samples, not all through the time that the record spans."""
+    rates = ((1000, 200), (0.0001, 1000))
+    batch, defects = opened(Recording(three_phases(100, 0), rates=rates).write(tmp_path / "a.cfg"))
+    assert 5 <= len(batch) <= 8
+    assert defects["samples fewer than 8 a cycle"] > 700
+
+
+def test_neither_stamps_nor_a_rate(tmp_path: Path) -> None:
+    path = Recording(three_phases(100, 0), rates=((1000, 200),)).write(tmp_path / "a.cfg")
+    path.write_text(path.read_text().replace("1000,200", "0,200"))
+    with pytest.raises(SourceError, match="no readable COMTRADE record"):
+        open_source(path)
+
+
 def test_rates_that_cannot_be_estimated(tmp_path: Path) -> None:
     path = sample().write(tmp_path / "a.cfg")
     for rate in (-1, 300):
