@@ -102,7 +102,8 @@ class Lateness:
 
     def add(self, streams: npt.NDArray[np.integer[Any]], late_ns: npt.NDArray[np.int64]) -> None:
         """Count frames (N,) of ``streams`` that left ``late_ns`` after their time; what left early counts as 0."""
-        np.add.at(self._bins.reshape(-1), streams * np.int64(_BINS) + _bins(late_ns), 1)
+        # a one of the same type takes the fast way, thirty times faster than any other
+        np.add.at(self._bins.reshape(-1), streams * np.int64(_BINS) + _bins(late_ns), np.uint32(1))
         missed = late_ns > self._miss_ns[streams]
         np.add.at(self._misses, streams[missed], 1)
         most = late_ns > self._max_ns[streams]  # few are: a maximum is slow to take

@@ -42,9 +42,9 @@ def to_ns_array(
 
 
 def from_ns_array(
-    time_ns: npt.NDArray[np.int64], time_base: int
+    time_ns: npt.NDArray[np.int64], time_base: int | npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """:func:`from_ns` over a column of shape (N,)."""
+    """:func:`from_ns` over a column of shape (N,); one time base, or (N,)."""
     soc, frac_ns = divmod(time_ns, NS)
     fracsec = (frac_ns * time_base + NS // 2) // NS
     carry = fracsec >= time_base

@@ -3,42 +3,115 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmutools import parsers
+from pmutools import linux, parsers
 from pmutools.cli.shell import Exit, F, Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION, END, START, Watched, spare
 from pmutools.errors import SettingsError
+from pmutools.timebase import NS, parse_utc
 
 if TYPE_CHECKING:
+    from pmutools.cli.play_display import Display
     from pmutools.impair.profile import Profile
     from pmutools.net.endpoint import Endpoint
-    from pmutools.tools.player.results import StreamResult
+    from pmutools.tools.player.cast import Spread
+    from pmutools.tools.player.material import Choice
+    from pmutools.tools.player.play import Options, Player
+    from pmutools.tools.player.results import Results
+    from pmutools.tools.recast import Form
+    from pmutools.tools.synth import Recipe
     from pmutools.tools.window import Moment
 
 MS = 1_000_000
-FAULTS = ("loss", "delay", "drop", "duplicate", "reorder", "corrupt", "disable")
+FAULTS = {
+    "corrupt": ("P%", "Damage frames."),
+    "config": ("CHANGE", "Change the configuration midstream: count() when=5..8, add(analogs=1), ..."),
+    "disable": ("NAME@T1..T2", "Switch a stream off from T1 to T2 s of stream time."),
+    "drop": ("LIST", "Leave out these data frames: 10,50-59,every 100 offset 3."),
+    "loss": ("P%", "Lose frames at random, or by a model: gemodel(1%,20%)."),
+    "duplicate": ("P%", "Send frames twice."),
+    "delay": ("DIST", "Delay in ms: constant(16), normal(16,2), ..."),
+    "reorder": ("P%", "Let frames overtake."),
+    "rate": ("BITS", "Send through a link of so many bit/s: 64k."),
+    "slot": ("DIST", "Let frames leave only every so many ms."),
+    "segment": ("P%", "Cut what is written to TCP: split(parts=2), coalesce(frames=4), reset(), ..."),
+}
+"""The options of :mod:`pmutools.impair`, in the order in which they apply; each is one of the command's."""
+TOLD_STREAMS = 20
+"""Results of more streams are told of the latest only, unless -v asks for all."""
 
 
-def _fault(name: str, metavar: str, text: str) -> Callable[[F], F]:
-    return click.option(f"--{name}", f"fault_{name}", multiple=True, metavar=metavar, help=text)
+def _faults(function: F) -> F:
+    for name, (metavar, text) in reversed(FAULTS.items()):
+        function = click.option(f"--{name}", f"fault_{name}", multiple=True, metavar=metavar, help=text)(function)
+    return function
 
 
 def _speed(text: str) -> Fraction:
     parsers.number(0.001, 1000)(text)
-    return Fraction(text.strip())
+    return Fraction(text.strip()).limit_denominator(1_000_000)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    old, equals, new = text.partition("=")
+    if not equals or not old.strip() or not new.strip():
+        raise ValueError(f"{text!r} is not of the form OLD=NEW")
+    return old.strip(), new.strip()
+
+
+def _idcodes(text: str) -> tuple[int, int]:
+    old, new = _pair(text)
+    return parsers.integer(0, 0xFFFF)(old), parsers.integer(1, 65534)(new)
+
+
+def _form(text: str) -> Form:
+    from pmutools.tools.recast import parse_form
+
+    return parse_form(text)
+
+
+def _spread(text: str) -> Spread:
+    from pmutools.tools.player.cast import parse_spread
+
+    return parse_spread(text)
 
 
 @click.command(name="play", short_help="Stream a recording live, as any number of PMUs.")
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.argument("files", nargs=-1, metavar="FILE...")
 @click.option("--to", multiple=True, metavar="URL", help="Send to udp://HOST:PORT; repeatable, ?idcode=N picks one.")
 @click.option("--listen", multiple=True, metavar="URL", help="Serve at tcp://, udp+cmd:// or tcp+udp://; repeatable.")
+@click.option("--plant", metavar="NAME", help="Instead of files: a simulated grid (modal).")
+@click.option("--scenario", default=None, metavar="NAME", help="What happens to the plant; default cjb.")
+@click.option("--pmus", type=click.IntRange(1, 200), metavar="N", help="PMUs of the plant; default 8.")
+@click.option("--select", multiple=True, metavar="NAME|IDCODE", help="Only this stream; repeatable.")
+@click.option("--exclude", multiple=True, metavar="NAME|IDCODE", help="Not this stream; repeatable.")
+@START
+@END
+@click.option(
+    "--skip-gaps",
+    "skip_gaps_ns",
+    type=Parsed(parsers.duration_ns(NS, 0)),
+    metavar="S",
+    help="Cut silences longer than S seconds down to S (whole seconds are left out).",
+)
+@click.option("--idcode", "idcodes", type=Parsed(_idcodes), multiple=True, metavar="OLD=NEW", help="Renumber a stream.")
+@click.option("--station", "stations", type=Parsed(_pair), multiple=True, metavar="OLD=NEW", help="Rename a station.")
+@click.option("--format", "form", type=Parsed(_form), metavar="WORDS", help="Another FORMAT: polar,int or rect,float.")
+@click.option(
+    "--pdc", "pdc_idcode", type=click.IntRange(1, 65534), metavar="IDCODE", help="All streams as one, a PDC's."
+)
+@click.option("--emulate", type=click.IntRange(1, 65534), metavar="N", help="N PMUs that share the source's streams.")
+@click.option("--spread", type=Parsed(_spread), metavar="mag=1,deg=5,mhz=2", help="Standard deviations among them.")
+@click.option("--together", is_flag=True, help="Emulated PMUs send at one instant, not spread over the interval.")
+@click.option("--data-rate", type=click.IntRange(1, 240), metavar="FPS", help="DATA_RATE of a table that does not say.")
+@click.option("--nominal", type=click.Choice(("50", "60")), help="Nominal frequency of a table that does not say.")
 @click.option("--stamp", type=click.Choice(("shift", "keep", "now-grid", "now")), default="shift", show_default=True)
 @click.option("--timing", type=click.Choice(("stamp", "arrival")), help="Default: arrival where recorded, else stamp.")
 @click.option("--speed", type=Parsed(_speed), default="1", show_default=True, metavar="X")
@@ -47,10 +120,7 @@ def _speed(text: str) -> Fraction:
     "--interval", "interval_ns", type=Parsed(parsers.duration_ns(MS, 0.001)), metavar="MS", help="Send spacing only."
 )
 @click.option("--loop", "loops", type=click.IntRange(0), default=1, show_default=True, help="0: for ever.")
-@START
-@END
-@click.option("--select", multiple=True, metavar="NAME|IDCODE", help="Only this stream; repeatable.")
-@click.option("--exclude", multiple=True, metavar="NAME|IDCODE", help="Not this stream; repeatable.")
+@click.option("--at", "begin_utc_ns", type=Parsed(parse_utc), metavar="UTC", help="Begin at this time.")
 @click.option(
     "--cfg-period",
     "cfg_period_ns",
@@ -61,114 +131,200 @@ def _speed(text: str) -> Fraction:
     help="0: at start.",
 )
 @click.option("--impair", metavar="PROFILE", help="Impairment profile: a ready one's name, or a file.")
-@_fault("loss", "P%", "Lose frames at random, or by a model: gemodel(1%,20%).")
-@_fault("delay", "DIST", "Delay in ms: constant(16), normal(16,2), ...")
-@_fault("drop", "LIST", "Leave out these data frames: 10,50-59,every 100 offset 3.")
-@_fault("duplicate", "P%", "Send frames twice.")
-@_fault("reorder", "P%", "Let frames overtake.")
-@_fault("corrupt", "P%", "Damage frames.")
-@_fault("disable", "NAME@T1..T2", "Switch a stream off from T1 to T2 s of stream time.")
+@_faults
 @click.option("--seed", type=Parsed(parsers.integer(0, 2**64 - 1)), metavar="N", help="Same seed, same faults.")
-@click.option("--emulate", type=click.IntRange(1, 65534), metavar="N", help="N PMUs that share the source's streams.")
-@click.option("--ledger", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.parquet")
+@click.option("--ledger", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.parquet", help="The truth.")
+@click.option("--control", metavar="PATH|HOST:PORT", help="Take orders from pmu ctl there.")
+@click.option("--interactive", is_flag=True, help="Keys, and a screen on this terminal.")
+@click.option("--paused", is_flag=True, help="Begin with a pause.")
+@click.option("--fifo", is_flag=True, help="Ask for the real-time scheduling policy SCHED_FIFO.")
+@click.option("--portable", is_flag=True, help="Do without batched system calls and kernel stamps.")
 @DURATION
 @common
 def command(
-    files: tuple[str, ...],
     to: tuple[str, ...],
     listen: tuple[str, ...],
-    stamp: str,
-    timing: str | None,
-    speed: Fraction,
-    fps: int | None,
-    interval_ns: int | None,
-    loops: int,
-    start: Moment | None,
-    end: Moment | None,
-    select: tuple[str, ...],
-    exclude: tuple[str, ...],
-    cfg_period_ns: int,
-    impair: str | None,
-    seed: int | None,
-    emulate: int | None,
+    control: str | None,
+    interactive: bool,
+    paused: bool,
+    fifo: bool,
+    portable: bool,
     ledger: Path | None,
-    duration_ns: int | None,
     as_json: bool,
     quiet: bool,
     verbose: int,
-    **faults: tuple[str, ...],
+    **said: Any,
 ) -> int:
-    """Play recordings live: every stream as a PMU of its own, restamped, on absolute deadlines.
+    """Play recordings, or a simulated grid, live: every stream as a PMU of its own, restamped, on absolute deadlines.
 
     With --listen alone, playing begins at the first start command. --duration ends it S seconds after it began to
     listen or send. At the end each stream's pacing error is told: that is the player's accuracy.
     """
     from pmutools.clock import SystemClock
+    from pmutools.impair.profile import parse_action
     from pmutools.net.endpoint import parse_endpoint
-    from pmutools.tools.player.cast import as_recorded, emulated
+    from pmutools.realtime import go_realtime
+    from pmutools.tools.player.control_address import parse_control_address
     from pmutools.tools.player.ledger import LedgerWriter
-    from pmutools.tools.player.play import Options, Player
-    from pmutools.tools.player.reel import at_interval, at_rate, record
-    from pmutools.tools.player.stamps import StampPolicy
-    from pmutools.tools.recordings import losses, open_recordings
-    from pmutools.tools.window import Window
+    from pmutools.tools.player.material import material
+    from pmutools.tools.player.play import Player
 
     talk = Talk(quiet, verbose)
     if not to and not listen:
         raise SettingsError("where to? give --to udp://HOST:PORT or --listen tcp://HOST:PORT")
-    if fps is not None and interval_ns is not None:
-        raise SettingsError("--fps and --interval clash: the first changes the stamps too, the second the spacing only")
-    if fps is not None and stamp == StampPolicy.KEEP:
-        raise SettingsError("--fps makes new stamps, --stamp keep keeps the old: leave one out")
-    options = Options(
-        to=[_sent_to(parse_endpoint(url)) for url in to],
-        listen=[_listening(parse_endpoint(url)) for url in listen],
-        policy=StampPolicy(stamp),
-        speed=speed,
-        loops=loops,
-        cfg_period_ns=cfg_period_ns,
-        profile=_profile(impair, faults),
-        seed=seed,
-        duration_ns=duration_ns,
-    )
+    endpoints = [_sent_to(parse_endpoint(url)) for url in to], [_listening(parse_endpoint(url)) for url in listen]
+    address = parse_control_address(control) if control else None
+    if interactive:
+        _require_terminal()
+    options, choice = _options(*endpoints, said), _choice(said)
     if ledger is not None:
-        spare(ledger, files)
-    source = open_recordings(files)
-    reel = record(Watched(source, talk).blocks(), timing, Window(start, end), select, exclude)
-    lost = losses(source)
-    if interval_ns is not None:
-        reel = at_interval(reel, interval_ns)
-    if fps is not None:
-        reel = at_rate(reel, fps)
-    cast = emulated(reel, emulate, options.seed or 0) if emulate else as_recorded(reel)
-    for pattern in options.profile.unmatched(cast.names(part) for part in range(len(cast.parts))):
-        talk.say(f"no stream is called {pattern!r}; there are {', '.join(part.name for part in cast.parts)}")
-    with (
-        interruptible() as stop,
-        Player(
-            cast,
-            options,
-            SystemClock(spin_ns=100_000),
-            stop=stop,
-            tell=lambda event: talk.say(f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip()),
-            warn=talk.say,
-            stamp_departures=ledger is not None,
-        ) as player,
-    ):
+        spare(ledger, choice.files)
+    stuff = material(choice, lambda source: Watched(source, talk))
+    cast = stuff.cast
+    for note in stuff.notes:
+        talk.say(note)
+    for pattern in options.profile.unmatched(map(cast.names, range(len(cast.parts)))):
+        names = ", ".join(part.name for part in cast.parts[:TOLD_STREAMS])
+        talk.say(f"no stream is called {pattern!r}; there are {names}")
+
+    native = linux.NATIVE and not portable
+    display: Display | None = None
+
+    def tell(text: str) -> None:
+        if display is not None:
+            display.note(text)
+        else:
+            talk.say(text)
+
+    def progress() -> None:
+        if display is None:
+            from pmutools.cli.status_text import progress_line
+
+            talk.progress(progress_line(player.status()))
+
+    with interruptible() as asked, ExitStack() as stack:
+        player = stack.enter_context(
+            Player(
+                cast,
+                options,
+                SystemClock(spin_ns=0 if fifo else SPIN_NS, native=native),
+                stop=lambda: asked() or (display is not None and display.quit),
+                tell=lambda event: tell(_event(event)),
+                warn=tell,
+                stamp_departures=ledger is not None,
+                native=native,
+            )
+        )
+        if paused:
+            player.act(parse_action("pause"))
+        if address is not None:
+            from pmutools.tools.player.control_server import ControlServer
+
+            stack.enter_context(ControlServer(address, player, player.senders.reactor, tell))
+        rows = stack.enter_context(LedgerWriter(ledger)) if ledger is not None else None
         for url in (*to, *listen):
-            talk.say(f"{len(cast.parts)} streams, {len(reel.rows)} data frames: {url}")
-        with LedgerWriter(ledger) if ledger is not None else nullcontext() as rows:
-            player.play(rows, lambda: talk.progress(f"{player.results.sent} frames sent"))
-        stopped = stop()
+            talk.say(f"{len(cast.parts)} streams, {len(cast.reel.rows)} data frames: {url}")
+        if interactive:
+            display = stack.enter_context(_display(player, _source(choice), (*to, *listen)))
+        shortfall = go_realtime(fifo=fifo)
+        if shortfall.fifo is not None:
+            tell(shortfall.fifo)
+        player.play(rows, progress)
+        stopped = asked()
+    display = None
     if as_json:
-        click.echo(json.dumps({"streams": [result.to_json() for result in player.results], "losses": lost}))
-    for result in player.results:
-        talk.say(_told(result))
-    for name, count in lost.items():
+        click.echo(json.dumps({"streams": player.to_json(), "losses": dict(stuff.losses)}))
+    _tell_results(player.results, talk, all_of_them=verbose > 0)
+    for name, count in stuff.losses.items():
         talk.say(f"  {name}: {count}")
     if stopped:
         return Exit.INTERRUPTED
-    return Exit.INCOMPLETE if lost else Exit.DONE
+    return Exit.INCOMPLETE if stuff.losses else Exit.DONE
+
+
+SPIN_NS = 200_000
+"""A busy wait of this length before each deadline takes the wake-up error away, for some percent of a core."""
+
+
+def _options(to: Sequence[Endpoint], listen: Sequence[Endpoint], said: dict[str, Any]) -> Options:
+    from pmutools.tools.player.play import Options
+    from pmutools.tools.player.stamps import StampPolicy
+
+    if said["fps"] is not None and said["interval_ns"] is not None:
+        raise SettingsError("--fps and --interval clash: the first changes the stamps too, the second the spacing only")
+    if said["fps"] is not None and said["stamp"] == StampPolicy.KEEP:
+        raise SettingsError("--fps makes new stamps, --stamp keep keeps the old: leave one out")
+    return Options(
+        to=to,
+        listen=listen,
+        policy=StampPolicy(said["stamp"]),
+        profile=_profile(said["impair"], {name: said[f"fault_{name}"] for name in FAULTS}),
+        **{name: said[name] for name in ("speed", "loops", "begin_utc_ns", "cfg_period_ns", "seed", "duration_ns")},
+    )
+
+
+def _choice(said: dict[str, Any]) -> Choice:
+    from pmutools.tools.player.material import Choice
+    from pmutools.tools.window import Window
+
+    start: Moment | None = said["start"]
+    same = ("timing", "select", "exclude", "form", "pdc_idcode", "skip_gaps_ns", "interval_ns", "emulate", "spread")
+    plant = _plant(said)
+    return Choice(
+        files=said["files"],
+        plant=plant,
+        data_rate=said["data_rate"],
+        fnom_hz=float(said["nominal"]) if said["nominal"] else None,
+        window=Window(start, said["end"]),
+        idcodes=_each_once("--idcode", said["idcodes"]),
+        stations=_each_once("--station", said["stations"]),
+        fps=None if plant is not None else said["fps"],
+        stagger=not said["together"],
+        seed=said["seed"] or 0,
+        **{name: said[name] for name in same},
+    )
+
+
+def _plant(said: dict[str, Any]) -> Recipe | None:
+    from pmutools.tools.synth import Recipe
+
+    if said["plant"] is None:
+        if not said["files"]:
+            raise SettingsError("what is to be played? name a recording, or give --plant NAME")
+        for option in ("scenario", "pmus"):
+            if said[option] is not None:
+                raise SettingsError(f"--{option} is of a simulated grid; give --plant NAME too")
+        return None
+    if said["files"]:
+        raise SettingsError(f"--plant and {said['files'][0]}: play one or the other")
+    return Recipe(
+        said["scenario"] or "cjb", said["plant"], said["pmus"] or 8, said["fps"] or 60, seed=said["seed"] or 1
+    )
+
+
+def _each_once(option: str, pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    found: dict[Any, Any] = {}
+    for old, new in pairs:
+        if found.setdefault(old, new) != new:
+            raise SettingsError(f"{option} {old}: given twice, once as {found[old]} and once as {new}")
+    return found
+
+
+def _source(choice: Choice) -> str:
+    return ", ".join(choice.files) if choice.plant is None else f"{choice.plant.scenario} on {choice.plant.plant}"
+
+
+def _require_terminal() -> None:
+    from pmutools.cli.play_display import require_terminal
+
+    require_terminal()
+
+
+def _display(player: Player, source: str, targets: tuple[str, ...]) -> Display:
+    from pmutools.cli.play_display import Display
+    from pmutools.cli.play_screen import Title
+
+    return Display(player, player.senders.reactor, Title(source, targets))
 
 
 def _sent_to(endpoint: Endpoint) -> Endpoint:
@@ -183,11 +339,25 @@ def _listening(endpoint: Endpoint) -> Endpoint:
     return endpoint
 
 
-def _told(result: StreamResult) -> str:
-    fates = ", ".join(f"{count} {fate}" for fate, count in result.fates.items()) or "nothing due"
-    late = result.late
+def _event(event: Any) -> str:
+    return f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip()
+
+
+def _tell_results(results: Results, talk: Talk, *, all_of_them: bool) -> None:
+    """What became of every stream, or of many: of all together, and of those that kept time worst."""
+    told = list(results)
+    if len(told) > TOLD_STREAMS and not all_of_them:
+        late = results.lateness.summary()
+        talk.say(f"  {len(told)} streams: {_told(results.fates(), late)}; the latest were (-v: all)")
+        told = sorted(told, key=lambda result: -result.late.p99_ns)[:5]
+    for result in told:
+        talk.say(f"  {result.name:<16} {_told(result.fates, result.late)}")
+
+
+def _told(fates: dict[str, int], late: Any) -> str:
+    text = ", ".join(f"{count} {fate}" for fate, count in fates.items()) or "nothing due"
     p50, p99, most = (f"{ns / 1000:.0f} us" for ns in (late.p50_ns, late.p99_ns, late.max_ns))
-    return f"  {result.name:<16} {fates}; late p50 {p50}, p99 {p99}, max {most}, {late.misses} misses"
+    return f"{text}; late p50 {p50}, p99 {p99}, max {most}, {late.misses} misses"
 
 
 def _profile(impair: str | None, faults: dict[str, tuple[str, ...]]) -> Profile:
@@ -195,5 +365,5 @@ def _profile(impair: str | None, faults: dict[str, tuple[str, ...]]) -> Profile:
     from pmutools.impair.profiles import load_profile
 
     profile = load_profile(impair) if impair is not None else Profile()
-    given = [(name, value) for name in FAULTS for value in faults.get(f"fault_{name}", ())]
+    given = [(name, value) for name, values in faults.items() for value in values]
     return profile.then(profile_of_options(given)) if given else profile

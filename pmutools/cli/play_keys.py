@@ -12,10 +12,10 @@ from glob import escape
 from typing import NamedTuple
 
 from pmutools.impair.profile import Action
+from pmutools.impair.verbs import Place
 from pmutools.timebase import NS
 from pmutools.tools.player.control import BY_NAME, parse_control
 from pmutools.tools.player.status import PlayerStatus, PlayState, StreamStatus
-from pmutools.impair.verbs import Place
 
 EVENTS = 40
 """Events kept for the screen."""
@@ -220,8 +220,9 @@ def foreseen(status: PlayerStatus, action: Action) -> PlayerStatus:
     """The state once ``action`` is done, as far as it can be told without asking the player."""
     if action.verb == "seek":
         (place,) = action.values
-        known = isinstance(place, Place) and place.relative
-        return replace(status, position_s=place.ns / NS) if known else status
+        if isinstance(place, Place) and place.relative:
+            return replace(status, position_s=place.ns / NS)
+        return status
     if action.verb == "speed":
         return replace(status, speed=float(action.argument))
     return replace(status, state=PlayState.PLAYING) if action.verb == "resume" else status

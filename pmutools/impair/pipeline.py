@@ -88,6 +88,8 @@ class Pipeline:
         self.seed = next(value for value in (seed, profile.seed, 0) if value is not None)
         self._config = config
         self._actions = deque(action for action in profile.timeline if self._concerns(action))
+        self.refused: list[str] = []
+        """What the timeline asked for and could not be, in words."""
         self._others = 0
         self._held = deque[_Held]()
         self._flushed: tuple[Outgoing, ...] = ()
@@ -148,14 +150,21 @@ class Pipeline:
         An option that is set anew starts with empty queues; its draws stay those of the frame's index. Raises
         SettingsError, and changes nothing, for what this stream cannot have.
         """
-        if not self._concerns(action) or action.rule is None:
+        if not self.check(action) or action.rule is None:
             return False
-        self._check(Treatment(), (action,), self._config)
         if action.verb == "fault":
             self._build(self._under(action.rule), [option for option, _ in action.rule.settings])
         else:
             self._throw(action, action.rule)
             self._refresh()
+        return True
+
+    def check(self, action: Action) -> bool:
+        """Whether ``action`` concerns this stream; raises SettingsError where it cannot be done."""
+        if not self._concerns(action) or action.rule is None:
+            return False
+        self._check(Treatment(), (action,), self._config)
+        self._under(action.rule)
         return True
 
     def configure(self, config: StreamConfig) -> None:
@@ -202,7 +211,10 @@ class Pipeline:
             return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns),)
         time_ns = offset_ns if stream_ns is None else stream_ns
         while self._actions and self._actions[0].at_ns <= time_ns:
-            self.act(self._actions.popleft())
+            try:
+                self.act(self._actions.popleft())
+            except SettingsError as error:  # with what was set live before, it cannot be
+                self.refused.append(str(error))
         original = Original(data, self._config, stamp_ns)
         marks: tuple[str, ...] = ()
         config = None

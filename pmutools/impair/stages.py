@@ -8,9 +8,11 @@ stages have one part. A value replaces what was set before,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+from pmutools.errors import SettingsError
 from pmutools.impair.config_change import ConfigChange
 from pmutools.impair.content import Corrupt
 from pmutools.impair.delays import Delay
@@ -22,6 +24,9 @@ from pmutools.impair.reorder import Duplicate, Reorder
 from pmutools.impair.segment import Segment
 from pmutools.impair.selectors import Selector, selector
 from pmutools.parsers import parsed_by
+
+MOST_PARTS = 64
+"""Of one option of one stream: what live control adds must not grow without bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +49,18 @@ class Stages:
     rate: tuple[Rate, ...] = ()
     slot: tuple[Slot, ...] = ()
     segment: tuple[Segment, ...] = ()
+    texts: Mapping[str, str] = field(default_factory=dict, compare=False)
+    """What is set, by option, as it can be written again."""
 
     def changed(self, option: str, setting: Setting) -> Stages:
-        """With one option set (or added to)."""
-        return replace(self, **{option: setting.onto(getattr(self, option))})
+        """With one option set (or added to); raises SettingsError for more than :data:`MOST_PARTS` parts."""
+        parts = setting.onto(getattr(self, option))
+        if len(parts) > MOST_PARTS:
+            raise SettingsError(f"{option}: more than {MOST_PARTS} parts; set it anew, without '+'")
+        texts = {name: text for name, text in self.texts.items() if name != option or setting.adds}
+        if parts:
+            texts[option] = "\n".join(filter(None, (texts.get(option, ""), setting.text)))
+        return replace(self, **{option: parts}, texts=texts)
 
 
 class Setting(NamedTuple):
@@ -55,6 +68,8 @@ class Setting(NamedTuple):
 
     parts: tuple[Any, ...]
     adds: bool = False
+    text: str = ""
+    """The parts as they were written."""
 
     def onto(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
         """The parts after this setting, where ``parts`` were there."""
@@ -89,4 +104,5 @@ def parse_setting(option: str, text: str) -> Setting:
         raise ValueError("no value; write 'none' to switch the stage off")
     if option not in SEVERAL and (adds or len(lines) > 1):
         raise ValueError("only one of these a stream; give it once, without '+'")
-    return Setting(tuple(parse_stage(OPTIONS[option], line) for line in lines), adds)
+    parts = tuple(parse_stage(OPTIONS[option], line) for line in lines)
+    return Setting(parts, adds, "\n".join(line.strip() for line in lines))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -95,6 +96,13 @@ class Outbox:
         self._loaded = (wire, at, nbytes, to)
         if self._columns is not None:
             self._columns.load(wire, at, nbytes, to.names, to.lengths)
+
+    @property
+    def direct(self) -> Callable[[int, int], list[int]] | None:
+        """What sends loaded datagrams where nobody asks for their departures; None on the portable path."""
+        if self._columns is None or self.departures is not None:
+            return None
+        return partial(self._columns.send, self.sock.fileno())
 
     def send(self, first: int, last: int, marks: I64) -> list[int]:
         """Send the loaded datagrams ``first`` to ``last - 1``; returns those that the system would not take.

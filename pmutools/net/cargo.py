@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,8 @@ from pmutools.flow import Segmentation
 from pmutools.net.audience import Addresses, Audience, Outbox, Sink, UdpSink
 
 I64 = npt.NDArray[np.int64]
+
+_NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +25,7 @@ class Frames:
     whole and at once.
     """
 
-    stream: npt.NDArray[np.integer[Any]]
+    stream: I64
     at: I64
     nbytes: I64
     wire: npt.NDArray[np.uint8]
@@ -59,6 +61,8 @@ class Table:
         sinks = [sink for own in udp for sink in own]
         self.boxes = list(dict.fromkeys(sink.outbox for sink in sinks))
         numbers = {box: number for number, box in enumerate(self.boxes)}
+        self.single = len(self.boxes) == 1 and not self.others and bool((self.udp_counts == 1).all())
+        """Whether every stream has one destination, and all leave by one socket."""
         self.box = np.array([numbers[sink.outbox] for sink in sinks], np.int64)
         """Of each datagram destination, its place in ``boxes``; those of a stream follow each other."""
         self.addresses = Addresses.of([sink.where for sink in sinks])
@@ -79,15 +83,23 @@ class Cargo:
         self.frames, self.version = frames, table.version
         self.counts: I64 = np.where(frames.wanted, table.counts[frames.stream], 0)
         """(N,) destinations of each frame; 0 for those not wanted."""
+        self._table = table
+        self._loads: list[_Load] = []
+        self.direct: Callable[[int, int], list[int]] | None = None
+        """Sends frames by their places at the least cost, where that is all there is to do."""
+        if table.single and frames.wanted.all():
+            self._others, outbox = _NONE, table.boxes[0]
+            outbox.load(frames.wire, frames.at, frames.nbytes, table.addresses.take(frames.stream))
+            self._loads.append(_Load(outbox, np.arange(len(frames)), frames.marks))
+            self.direct = outbox.direct
+            return
         wanted = np.flatnonzero(frames.wanted)
         streams = frames.stream[wanted]
-        self._table = table
         self._others = wanted[table.has_others[streams]]
         counts = table.udp_counts[streams]
         rows = np.repeat(wanted, counts)
         within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
         sinks = np.repeat(table.udp_firsts[streams], counts) + within
-        self._loads = []
         for number, outbox in enumerate(table.boxes):
             own = np.flatnonzero(table.box[sinks] == number) if len(table.boxes) > 1 else slice(None)
             chosen, addresses = rows[own], table.addresses.take(sinks[own])

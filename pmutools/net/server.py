@@ -212,6 +212,8 @@ class Senders:
 
         Returns the rows that a destination did not take, once for each destination.
         """
+        if cargo.direct is not None:
+            return cargo.direct(first, last)
         failed = cargo.send(first, last, self._clock.monotonic_ns())
         return failed + self._flush() if self._dirty else failed
 

@@ -9,9 +9,11 @@ from pmutools.formats import open_source
 from pmutools.formats.source import Source
 
 
-def open_recordings(paths: Sequence[str | Path]) -> Source:
-    """The recordings merged on time; raises SourceError or SettingsError as :func:`open_source` does."""
-    sources = [open_source(path) for path in paths]
+def open_recordings(
+    paths: Sequence[str | Path], *, data_rate: int | None = None, fnom_hz: float | None = None
+) -> Source:
+    """The recordings merged on time; arguments, SourceError and SettingsError as of :func:`open_source`."""
+    sources = [open_source(path, data_rate=data_rate, fnom_hz=fnom_hz) for path in paths]
     if len(sources) == 1:
         return sources[0]
     from pmutools.formats.folder import MergedSource

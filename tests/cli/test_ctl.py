@@ -50,7 +50,7 @@ def player() -> Iterator[FakePlayer]:
     [
         (["pause"], "pause"),
         (["step", "2"], "step 2"),
-        (["seek", "-1.5"], "seek -1.5"),
+        (["seek", "-1.5"], "seek 1.5"),
         (["loop", "1", "2.5"], "loop 1 2.5"),
         (["loop", "off"], "loop off"),
         (["fault", "N1", "loss=5%"], "fault N1"),

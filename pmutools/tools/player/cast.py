@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -192,10 +192,9 @@ class Cast:
             frequency=batch.frequency + offset_hz[:, None],
             wire=None,
         )
-        fresh = encode_batch(batch)[0].copy()
-        old = wire_view(wire, config)
-        for name in ("soc", "fracsec"):
-            fresh[name] = old[name]
+        fresh: npt.NDArray[Any] = encode_batch(batch)[0].copy()
+        old: npt.NDArray[Any] = wire_view(wire, config)
+        fresh["soc"], fresh["fracsec"] = old["soc"], old["fracsec"]  # the latter with the time quality
         return bytes(fresh.tobytes())
 
 
@@ -244,8 +243,7 @@ def _spread(part: Part, spread: Spread, seed: int) -> Part:
 
 def _renamed(config: StreamConfig, part: Part) -> StreamConfig:
     """The configuration of an emulated PMU: its own IDCODE and name; several stations keep theirs behind its number."""
-    if len(config.stations) == 1:
+    stations = config.stations
+    if len(stations) == 1:
         stations = (replace(config.stations[0], name=part.name, wire_name=None, idcode=part.idcode),)
-    else:
-        stations = config.stations
     return replace(config, idcode=part.idcode, stations=stations)

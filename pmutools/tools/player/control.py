@@ -89,9 +89,7 @@ def _nothing(text: str) -> None:
 
 
 VERBS = (
-    Verb(
-        "pause", "[S]", "Stop the source's time where it is, for S seconds or until `resume`; clients stay connected."
-    ),
+    Verb("pause", "[S]", "Stop the source's time where it is, for S seconds or until `resume`."),
     Verb("resume", "", "Go on from there."),
     Verb("step", "[N]", "While paused: the next frame instant of all streams, or the next N."),
     Verb("seek", "T", "Go on at T: seconds into the source, or UTC."),

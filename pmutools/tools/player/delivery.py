@@ -55,42 +55,42 @@ class Delivery:
             sheet.nbytes,
             sheet.wire,
             sheet.fate == SENT,
-            base + np.arange(count),
+            np.arange(base, base + count),
             [extra.write if extra is not None else None for extra in sheet.extra] if sheet.special else None,
         )
         cargo = self._senders.load(frames)
         offsets, stops = sheet.offset_ns.tolist(), [*self._stops(sheet), count]
-        left_ns = np.zeros(count, np.int64)
-        counts = cargo.counts.copy()
-        refused = np.zeros(count, np.int64)
-        done, going = 0, True
-        while done < count:
-            due = bisect_right(offsets, self._clock.monotonic_ns() - anchor_ns, done)
+        ends, times = [0], list[int]()
+        counts, refused = cargo.counts, list[int]()
+        done, going, monotonic_ns = 0, serve(self._clock.monotonic_ns()), self._clock.monotonic_ns
+        while done < count and going:
+            due = bisect_right(offsets, monotonic_ns() - anchor_ns, done)
             if due == done:
                 going = serve(anchor_ns + offsets[done])
-                if not going:
-                    break
                 continue
             if done == stops[0]:
                 self._reconfigure(sheet, stops.pop(0))
             if self._senders.stale(cargo):
                 cargo = self._senders.load(frames)
-                counts[done:] = cargo.counts[done:]
+                counts = np.concatenate([counts[:done], cargo.counts[done:]])
             due = min(due, stops[0], done + TOGETHER_FRAMES)
-            for row in self._senders.send(cargo, done, due):
-                refused[row] += 1
-            left_ns[done:due] = self._clock.monotonic_ns() - anchor_ns
+            refused += self._senders.send(cargo, done, due)
+            times.append(monotonic_ns() - anchor_ns)
+            ends.append(due)
             done = due
         if done < count:
-            sheet, left_ns, counts, refused = sheet.take(slice(0, done)), left_ns[:done], counts[:done], refused[:done]
-        self._account(sheet, left_ns, counts, refused)
+            sheet, counts = sheet.take(slice(0, done)), counts[:done]
+        self._account(sheet, np.repeat(np.array(times, np.int64), np.diff(ends)), counts, refused)
         return going
 
-    def _account(self, sheet: Sheet, left_ns: I64, counts: I64, refused: I64) -> None:
-        fate = sheet.fate.copy()
-        sent = fate == SENT
-        fate[sent & (refused >= counts) & (refused > 0)] = FAILED
-        fate[sent & (counts == 0)] = SKIPPED
+    def _account(self, sheet: Sheet, left_ns: I64, counts: I64, refused: list[int]) -> None:
+        """What became of copies that left at ``left_ns``, for ``counts`` destinations; ``refused`` by a destination."""
+        fate = sheet.fate
+        if refused or not counts.all():
+            refusals = np.bincount(refused, minlength=len(sheet))
+            fate = fate.copy()
+            fate[(fate == SENT) & (refusals >= counts) & (refusals > 0)] = FAILED
+            fate[(fate == SENT) & (counts == 0)] = SKIPPED
         self._results.add(sheet.part, fate, left_ns - sheet.offset_ns)
         if self._ledger is not None:
             self._ledger.add(sheet, fate, left_ns)

@@ -18,10 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
+from pmutools.errors import SettingsError
 from pmutools.flow import Hangup
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
-from pmutools.impair.profile import Action
+from pmutools.impair.profile import Action, parse_action
 from pmutools.impair.verbs import Place
 from pmutools.pacing import Playback
 from pmutools.timebase import NS
@@ -277,32 +278,32 @@ class Plan:
     def act(self, action: Action, offset_ns: int) -> None:
         """Do a player's verb at ``offset_ns``, or as soon after what is planned already as can be."""
         offset_ns = max(offset_ns, self._planned_ns)
-        match action.verb:
-            case "pause":
-                if action.values:
-                    self._go(offset_ns + int(action.values[0]), self._cursor_ns)
-                else:
-                    self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
-            case "resume":
+        match action.verb, *action.values:
+            case ["pause"]:
+                self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
+            case ["pause", int(for_ns)]:
+                self._go(offset_ns + for_ns, self._cursor_ns)
+            case ["resume"]:
                 if self.paused:
                     self._go(offset_ns, self._cursor_ns)
-            case "step":
-                self._step(offset_ns, int(action.values[0]) if action.values else 1)
-            case "speed":
+            case ["step", int(count)]:
+                self._step(offset_ns, count)
+            case ["speed", Fraction() as speed]:
                 self._playback = Playback(
                     max(offset_ns, self._here_ns()) if self._playback.running else offset_ns,
                     self._cursor_ns,
-                    Fraction(action.values[0]),
+                    speed,
                     self._playback.running,
                 )
-            case "seek":
-                self.seek(offset_ns, self._position(action.values[0]))
-            case "loop":
+            case ["seek", Place() as place]:
+                self.seek(offset_ns, self._position(place))
+            case ["loop"]:
                 self.between_ns = None
-                if action.values:
-                    self.between_ns = (self._position(action.values[0]), self._position(action.values[1]))
-                if self.between_ns is not None and not self.between_ns[0] <= self.position_ns < self.between_ns[1]:
-                    self.seek(offset_ns, self.between_ns[0])
+            case ["loop", Place() as a, Place() as b]:
+                first_ns, last_ns = self._position(a), self._position(b)
+                self.between_ns = (first_ns, last_ns)
+                if not first_ns <= self.position_ns < last_ns:
+                    self.seek(offset_ns, first_ns)
 
     def _position(self, place: Place) -> int:
         """Within the recording."""
@@ -357,8 +358,13 @@ class Plan:
 
     # --- streams
 
+    def warnings(self) -> list[str]:
+        """What a person should know of what was planned since last asked."""
+        warnings, self._route.warnings = self._route.warnings, []
+        return warnings
+
     def gates(self) -> list[Gate]:
-        """What TCP clients are to see of streams that fall silent, and come back, in what was planned since last asked."""
+        """What TCP clients are to see of streams that fall silent, and come back, since this was last asked."""
         gates, self._route.gates = self._route.gates, []
         return gates
 
@@ -380,12 +386,15 @@ class _Route:
         self._origins: list[dict[int, _Origin]] = [{} for _ in pipelines]
         self._edition = cast.editions.copy()
         self.gates: list[Gate] = []
+        self.warnings: list[str] = []
         self._hung: dict[int, Hangup | None] = {}
         self._mode = np.array([_mode(pipeline) for pipeline in pipelines], np.int8)
 
     def act(self, action: Action) -> list[int]:
         for part in np.flatnonzero(self._mode == _CLEAR).tolist():
             self._pipelines[part].delays_ns(np.zeros(1, np.int64))  # it has not seen the frames that passed it by
+        for pipeline in self._pipelines:  # of several streams, all or none
+            pipeline.check(action)
         concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
         for part in concerned:
             self._mode[part] = _mode(self._pipelines[part])
@@ -426,7 +435,13 @@ class _Route:
 
     def _configure(self, part: int, edition: int) -> None:
         self._edition[part] = edition
-        self._pipelines[part].configure(self._cast.config(part, edition))
+        pipeline, config = self._pipelines[part], self._cast.config(part, edition)
+        try:
+            pipeline.configure(config)
+        except SettingsError as error:
+            self.warnings.append(f"{error}; from here on this stream has no content faults")
+            pipeline.act(_NO_CONTENT)
+            pipeline.configure(config)
         self._mode[part] = _mode(self._pipelines[part])
 
     def _faulty(self, sheet: Sheet, stream_ns: I64) -> Sheet:
@@ -470,6 +485,9 @@ class _Route:
             if hangup is not self._hung.get(part):
                 self._hung[part] = hangup
                 self.gates.append(Gate(int(sheet.offset_ns[row]), part, hangup))
+            if pipeline.refused:
+                self.warnings += pipeline.refused
+                pipeline.refused.clear()
             if not pipeline.holding:
                 origins.clear()
                 self._mode[part] = _mode(pipeline)
@@ -521,6 +539,9 @@ def _extra(copy: Outgoing) -> Extra | None:
 
 
 _ORDINARY = Extra()
+
+
+_NO_CONTENT = parse_action("fault * corrupt=none")
 
 
 def _mode(pipeline: Pipeline) -> int:

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from types import TracebackType
-from typing import Any
+from typing import Any, overload
 
+from pmutools import linux
 from pmutools.c37118.session import Outcome, Served, served
 from pmutools.clock import Clock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError
@@ -34,7 +35,7 @@ POLL_NS = NS // 10
 LEAD_NS = 2_000_000
 """How long before its first frame is due a sheet is made."""
 SHEET_NS = 10_000_000
-SHEET_FRAMES = 512
+SHEET_FRAMES = 256
 """A sheet is as long as about so many frames take, and at most SHEET_NS: making one holds up those that are due, and
 what an operator changes begins with the next."""
 UTC_CHECK_NS = NS
@@ -63,8 +64,8 @@ class Player:
     """One run of a cast. Sockets are open once this is made; :attr:`results` are up to date at any time.
 
     ``stop`` is asked at least every 0.1 s whether to end early, ``tell`` is given the news of clients, ``warn`` what a
-    person should know. ``senders`` is for tests. Raises SourceError where an endpoint cannot be opened, SettingsError
-    for one that cannot be.
+    person should know. ``native=False`` takes the portable path; ``senders`` is for tests. Raises SourceError where an
+    endpoint cannot be opened, SettingsError for one that cannot be.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Player:
         tell: Callable[[ServerEvent], None] = lambda event: None,
         warn: Callable[[str], None] = lambda text: None,
         stamp_departures: bool = False,
+        native: bool = linux.NATIVE,
         senders: Senders | None = None,
     ) -> None:
         self.cast, self.options, self.clock = cast, options, clock
@@ -101,7 +103,10 @@ class Player:
         self._recent = deque[tuple[int, int]]()
         self._actions = deque[Action]()
         self.senders = senders or Senders(
-            clock, cfg_period_ns=options.cfg_period_ns or None, stamp_departures=stamp_departures
+            clock,
+            cfg_period_ns=options.cfg_period_ns or None,
+            native=native,
+            stamp_departures=stamp_departures,
         )
         try:
             self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(cast.editions)]
@@ -199,6 +204,8 @@ class Player:
                 continue
             until_ns = next_ns + sheet_ns
             sheet = plan.until(until_ns if last_ns is None else min(until_ns, last_ns))
+            for warning in plan.warnings():
+                self._warn(warning)
             for gate in plan.gates():
                 first = int(sheet.offset_ns.searchsorted(gate.offset_ns))
                 if not delivery.send(sheet.take(slice(0, first)), self._anchor_ns, self._serve_until):
@@ -246,7 +253,7 @@ class Player:
         return False
 
     def _serve_until(self, deadline_ns: int, once: bool = False) -> bool:
-        """Answer clients until ``deadline_ns``, or with ``once`` until something has happened; false if told to stop."""
+        """Answer clients until ``deadline_ns``, or with ``once`` until something has happened; false: told to stop."""
         while not self._stop():
             for event in self.senders.serve_until(min(deadline_ns, self.clock.monotonic_ns() + POLL_NS)):
                 self._tell(event)
@@ -313,20 +320,6 @@ class Player:
         state = PlayState.PAUSED if plan is not None and plan.paused and not plan.ended else self._state
         between = plan.between_ns if plan is not None else None
         elapsed_ns = self.clock.monotonic_ns() - self._anchor_ns if plan is not None else 0
-        streams = tuple(
-            StreamStatus(
-                part.name,
-                part.idcode,
-                pipeline.enabled,
-                self.senders.audience(handle),
-                self.results.fates(number),
-                _pacing(self.results.lateness.summary(number)),
-                pipeline.stages.texts(),
-            )
-            for number, (part, pipeline, handle) in enumerate(
-                zip(self.cast.parts, self.pipelines, self.handles, strict=True)
-            )
-        )
         return PlayerStatus(
             state,
             plan.position_ns / NS if plan is not None else 0.0,
@@ -338,7 +331,19 @@ class Player:
             self._frames_per_s(),
             self.results.sent,
             _pacing(self.results.lateness.summary()),
-            streams,
+            _Statuses(self),
+        )
+
+    def stream_status(self, part: int) -> StreamStatus:
+        """Of one stream."""
+        return StreamStatus(
+            self.cast.parts[part].name,
+            self.cast.parts[part].idcode,
+            self.pipelines[part].enabled,
+            self.senders.audience(self.handles[part]),
+            self.results.fates(part),
+            _pacing(self.results.lateness.summary(part)),
+            dict(self.pipelines[part].stages.texts),
         )
 
     def _frames_per_s(self) -> float:
@@ -351,6 +356,28 @@ class Player:
     def to_json(self) -> list[dict[str, Any]]:
         """The results of all streams."""
         return [result.to_json() for result in self.results]
+
+
+class _Statuses(Sequence[StreamStatus]):
+    """Every stream's status, when it is asked for."""
+
+    def __init__(self, player: Player) -> None:
+        self._player = player
+
+    def __len__(self) -> int:
+        return len(self._player.cast.parts)
+
+    @overload
+    def __getitem__(self, place: int) -> StreamStatus: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[StreamStatus]: ...
+
+    def __getitem__(self, place: int | slice) -> StreamStatus | Sequence[StreamStatus]:
+        places = range(len(self))[place]
+        if isinstance(places, int):
+            return self._player.stream_status(places)
+        return [self._player.stream_status(part) for part in places]
 
 
 def _offer(cast: Cast, part: int, edition: int) -> Served:

@@ -215,7 +215,7 @@ class _Recorder:
         if self._bytes <= SPOOL_BYTES:
             return np.frombuffer(self._spool.read(), np.uint8)
         self._spool.flush()
-        return np.memmap(self._spool._file, np.uint8, "r")  # type: ignore[attr-defined]  # it is a file by now
+        return np.memmap(self._spool._file, np.uint8, "r")  # it is a file by now
 
 
 def _latencies(stamps: I64, arrivals: I64) -> I64:

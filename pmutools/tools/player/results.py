@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,12 +81,13 @@ class Results:
         counts = self._fates.sum(axis=0) if stream is None else self._fates[stream]
         return {str(fate): int(count) for fate, count in zip(FATES, counts, strict=True) if count}
 
+    def __iter__(self) -> Iterator[StreamResult]:
+        return (self[stream] for stream in range(len(self)))
+
     def __len__(self) -> int:
         return len(self._names)
 
     def __getitem__(self, stream: int) -> StreamResult:
-        if not 0 <= stream < len(self._names):
-            raise IndexError(stream)
         return StreamResult(
             self._names[stream], self._idcodes[stream], self.fates(stream), self.lateness.summary(stream)
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,16 +64,15 @@ class Sheet:
 
     def take(self, rows: npt.NDArray[Any] | slice) -> Sheet:
         """Some of the copies; their bytes are shared."""
-        return Sheet(*(getattr(self, name)[rows] for name in _COLUMNS), self.wire)
+        columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        return Sheet(**columns, wire=self.wire)
 
     def compact(self) -> Sheet:
         """The same with bytes of its own."""
         total = int(self.nbytes.sum())
         starts = np.cumsum(self.nbytes) - self.nbytes
         places = np.repeat(self.at - starts, self.nbytes) + np.arange(total)
-        columns = [getattr(self, name) for name in _COLUMNS if name != "at"]
-        place = _COLUMNS.index("at")
-        return Sheet(*columns[:place], starts, *columns[place:], self.wire[places])
+        return replace(self, at=starts, wire=self.wire[places])
 
     def in_order(self) -> Sheet:
         """Sorted by time; copies of one time stay in order."""
@@ -156,4 +155,4 @@ def clean(
     )
 
 
-EMPTY = Sheet(*(np.zeros(0, _TYPES.get(name, np.int64)) for name in _COLUMNS), np.zeros(0, np.uint8))
+EMPTY = Sheet(**{name: np.zeros(0, _TYPES.get(name, np.int64)) for name in _COLUMNS}, wire=np.zeros(0, np.uint8))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import Any
 
@@ -54,7 +55,9 @@ class PlayerStatus:
     frames_per_s: float
     sent: int
     pacing: PacingStatus
-    streams: tuple[StreamStatus, ...]
+    streams: Sequence[StreamStatus]
+    """Each worked out when it is looked at: there may be thousands."""
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+        head = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "streams"}
+        return head | {"pacing": asdict(self.pacing), "streams": [asdict(stream) for stream in self.streams]}
