@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bench import capture, codec, control, startup, table
+from bench import capture, codec, control, pacing, startup, table
 from bench.layouts import BLOCK, LAYOUTS, B, C, Layout
 from bench.stopwatch import Rate
 from bench.table import Budget, Row
@@ -48,6 +49,18 @@ def test_every_group_gives_its_rows() -> None:
     lines = table.markdown(rows, ["How."]).splitlines()
     assert len(lines) == len(rows) + 4
     assert {line.count("|") for line in lines[2:]} == {len(table.HEAD) + 1}
+
+
+@pytest.mark.peer
+@pytest.mark.realtime
+def test_the_player_is_watched_beside_tcpreplay(requires: Callable[[str], Path]) -> None:
+    requires("tcpreplay")
+    requires("tcpdump")
+    if os.geteuid():
+        pytest.skip("tcpdump and tcpreplay need root to look at loopback")
+    rows = list(pacing.rows(pacing.QUICK))
+    assert len(rows) == 4
+    assert all(row.budget is not None and row.group == "player" for row in rows)
 
 
 def test_a_ratio_is_that_of_the_rounds() -> None:
