@@ -201,6 +201,9 @@ class Stage:
     def take_up(self, handle: int) -> None:
         self.gates.append((self.now_ns, handle, None))
 
+    def wake(self) -> None:
+        """Nobody is asleep in virtual time."""
+
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         return self.serve_until(self.clock.monotonic_ns() + (timeout_ns or 0))
 

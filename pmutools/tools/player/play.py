@@ -313,6 +313,7 @@ class Player:
             self._plan.fault(action)
         else:
             self._plan.act(action, self.clock.monotonic_ns() - self._anchor_ns)
+            self.senders.wake()
 
     def status(self) -> PlayerStatus:
         """What it is doing now."""
