@@ -13,13 +13,10 @@ import os
 import struct
 import sys
 from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 NATIVE = sys.platform == "linux" and sys.maxsize > 2**32 and os.environ.get("PMUTOOLS_PORTABLE") != "1"
-_libc = ctypes.CDLL(None, use_errno=True) if NATIVE else None
+libc = ctypes.CDLL(None, use_errno=True) if NATIVE else None
 
 # Socket options and flags absent from the socket module of Python 3.11 (asm-generic values: x86-64, arm64).
 SO_TIMESTAMPNS = 35
@@ -36,18 +33,17 @@ TX_SOFTWARE, SOFTWARE, OPT_ID, OPT_TSONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 MEMINFO_DROPS = 8
 """Index of the drop counter among the nine uint32 of SO_MEMINFO."""
 
-_SOL_SOCKET = 1
-_MSG_DONTWAIT = 0x40
-_MSG_ERRQUEUE = 0x2000
-_NS = 1_000_000_000
+SOL_SOCKET = 1
+MSG_DONTWAIT = 0x40
+NS = 1_000_000_000
 
 
 def sleep_until(deadline_ns: int) -> None:
     """clock_nanosleep to an absolute CLOCK_MONOTONIC time, through signals that do not raise; needs ``NATIVE``."""
-    assert _libc is not None
+    assert libc is not None
     monotonic, absolute = 1, 1
-    request = (ctypes.c_int64 * 2)(*divmod(max(deadline_ns, 0), _NS))
-    while error := _libc.clock_nanosleep(monotonic, absolute, request, None):
+    request = (ctypes.c_int64 * 2)(*divmod(max(deadline_ns, 0), NS))
+    while error := libc.clock_nanosleep(monotonic, absolute, request, None):
         if error != errno.EINTR:
             raise OSError(error, os.strerror(error))
 
@@ -57,10 +53,10 @@ def sleep_until(deadline_ns: int) -> None:
 
 def timer_slack(slack_ns: int = 1) -> str | None:
     """Let the kernel delay this thread's wake-ups by ``slack_ns`` only (default 50 µs). None, or why not."""
-    if _libc is None:
+    if libc is None:
         return "timer slack: only Linux has it"
     pr_set_timerslack = 29
-    if _libc.prctl(pr_set_timerslack, ctypes.c_ulong(slack_ns), 0, 0, 0):
+    if libc.prctl(pr_set_timerslack, ctypes.c_ulong(slack_ns), 0, 0, 0):
         return f"timer slack: {os.strerror(ctypes.get_errno())}"
     return None
 
@@ -81,14 +77,14 @@ def lock_memory() -> str | None:
 
     Future mappings are locked too only where no RLIMIT_MEMLOCK holds: under a limit they would start to fail.
     """
-    if _libc is None:
+    if libc is None:
         return "memory lock: only Linux has it"
     import resource
 
     mcl_current, mcl_future = 1, 2
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     free = limit == resource.RLIM_INFINITY or _may_lock_memory()
-    if _libc.mlockall(mcl_current | mcl_future if free else mcl_current):
+    if libc.mlockall(mcl_current | mcl_future if free else mcl_current):
         return f"memory lock: {os.strerror(ctypes.get_errno())}; raise RLIMIT_MEMLOCK ({limit} bytes) for it"
     return None
 
@@ -129,10 +125,10 @@ _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
 
 def clock_status() -> ClockStatus | None:
     """Read the state of CLOCK_REALTIME, without privilege; None where there is no adjtimex."""
-    if _libc is None:
+    if libc is None:
         return None
     timex = ctypes.create_string_buffer(_TIMEX.size)
-    state = _libc.adjtimex(timex)
+    state = libc.adjtimex(timex)
     if state < 0:
         return None
     _, offset, frequency, max_error, estimated, status, *_rest, tai = _TIMEX.unpack(timex.raw)
@@ -209,9 +205,9 @@ class ReceiveBatch:
         OSError
             The socket's pending error, such as ECONNREFUSED on a connected one.
         """
-        assert _libc is not None
+        assert libc is not None
         self._headers[:] = self._fresh  # the kernel overwrites the lengths
-        count = _libc.recvmmsg(fd, self._headers_at, self.size, _MSG_DONTWAIT, None)
+        count = libc.recvmmsg(fd, self._headers_at, self.size, MSG_DONTWAIT, None)
         if count < 0:
             error = ctypes.get_errno()
             if error in (errno.EAGAIN, errno.EINTR):
@@ -229,7 +225,7 @@ class ReceiveBatch:
     def _stamp_ns(self, at: int) -> int | None:
         """The stamp of SO_TIMESTAMPNS, the one control message that our sockets ask for."""
         _size, level, kind, seconds, nanoseconds = _STAMP.unpack_from(self._controls, at)
-        return seconds * _NS + nanoseconds if level == _SOL_SOCKET and kind == SO_TIMESTAMPNS else None
+        return seconds * NS + nanoseconds if level == SOL_SOCKET and kind == SO_TIMESTAMPNS else None
 
 
 class SockAddr:
@@ -265,7 +261,7 @@ class SendBatch:
     def _send(
         self, fd: int, frames: Sequence[bytes], targets: Sequence[SockAddr], start: int, failed: list[int]
     ) -> None:
-        assert _libc is not None
+        assert libc is not None
         joined = b"".join(frames)
         base = ctypes.cast(ctypes.c_char_p(joined), ctypes.c_void_p).value or 0
         pack_iovec, pack_name, headers, iovecs = _IOVEC.pack_into, _NAME.pack_into, self._headers, self._iovecs
@@ -276,140 +272,9 @@ class SendBatch:
         done = 0
         while done < len(frames):
             left = len(frames) - done
-            sent = _libc.sendmmsg(fd, ctypes.c_void_p(self._headers_at + done * 64), left, _MSG_DONTWAIT)
+            sent = libc.sendmmsg(fd, ctypes.c_void_p(self._headers_at + done * 64), left, MSG_DONTWAIT)
             if sent > 0:
                 done += sent
             elif ctypes.get_errno() != errno.EINTR:
                 failed.append(start + done)  # an error always concerns the first datagram of the call
                 done += 1
-
-
-_IOVECS = np.dtype([("base", "u8"), ("size", "u8")])
-_MMSGHDRS = np.dtype(
-    {
-        "names": ["name", "namelen", "iov", "iovlen", "control", "controllen"],
-        "formats": ["u8", "u4", "u8", "u8", "u8", "u8"],
-        "offsets": [0, 8, 16, 24, 32, 40],
-        "itemsize": 64,
-    }
-)
-_LONGEST_CALL = 1024
-
-
-def _array_address(array: NDArray[Any]) -> int:
-    return int(array.__array_interface__["data"][0])
-
-
-class SendColumns:
-    """Datagrams for sendmmsg given as columns: where in one buffer each lies, and where it goes.
-
-    ``size`` is the number it has room for; more is made as it is asked for.
-    """
-
-    def __init__(self, size: int = _LONGEST_CALL) -> None:
-        self._count = 0
-        self._base: NDArray[np.uint8] | None = None
-        self._make_room(size)
-
-    def _make_room(self, size: int) -> None:
-        self._iovecs = np.zeros(size, _IOVECS)
-        self._headers = np.zeros(size, _MMSGHDRS)
-        self._headers["iov"] = _array_address(self._iovecs) + 16 * np.arange(size, dtype=np.uint64)
-        self._headers["iovlen"] = 1
-        self._headers_at = _array_address(self._headers)
-
-    def load(
-        self,
-        base: NDArray[np.uint8],
-        at: NDArray[np.int64],
-        nbytes: NDArray[np.integer[Any]],
-        names: NDArray[np.uint64],
-        namelens: NDArray[np.uint32],
-    ) -> None:
-        """Take the datagrams ``base[at[i] : at[i] + nbytes[i]]``; ``base`` (contiguous) is kept until the next load.
-
-        ``names[i]`` is the address in memory of a socket address of ``namelens[i]`` bytes (:class:`SockAddr`, kept by
-        the caller), or 0 on a connected socket.
-        """
-        self._count = count = len(at)
-        if count > len(self._headers):
-            self._make_room(max(count, 2 * len(self._headers)))
-        self._base = base
-        iovecs, headers = self._iovecs[:count], self._headers[:count]
-        iovecs["base"] = at + _array_address(base)
-        iovecs["size"] = nbytes
-        headers["name"] = names
-        headers["namelen"] = namelens
-
-    def send(self, fd: int, first: int, last: int) -> list[int]:
-        """Send the datagrams [first, last); returns those, as places in the load, that the kernel would not take."""
-        assert _libc is not None
-        if not 0 <= first <= last <= self._count:
-            raise IndexError(f"datagrams {first}..{last} of {self._count}")
-        failed: list[int] = []
-        while first < last:
-            at = ctypes.c_void_p(self._headers_at + first * 64)
-            sent = _libc.sendmmsg(fd, at, min(last - first, _LONGEST_CALL), _MSG_DONTWAIT)
-            if sent > 0:
-                first += sent
-            elif ctypes.get_errno() != errno.EINTR:
-                failed.append(first)  # an error always concerns the first datagram of the call
-                first += 1
-        return failed
-
-
-# --- when datagrams left -----------------------------------------------------------------------------------------
-
-_DEPARTURE_ROOM = 192
-_STAMPNS_SPACE = 32
-"""A control message of SO_TIMESTAMPNS, which goes before where a socket has asked for it."""
-_DEPARTURE = np.dtype(
-    {
-        # struct cmsghdr with scm_timestamping, then struct cmsghdr with sock_extended_err
-        "names": ["level", "kind", "seconds", "nanoseconds", "errno", "origin", "info", "id"],
-        "formats": ["i4", "i4", "i8", "i8", "u4", "u1", "u4", "u4"],
-        "offsets": [8, 12, 16, 24, 80, 84, 88, 92],
-        "itemsize": _DEPARTURE_ROOM,
-    }
-)
-_ORIGIN_TIMESTAMPING = 4
-_TSTAMP_SND = 0
-
-
-class DepartureBatch:
-    """Buffers for reading the kernel's stamps of what was sent from error queues, at most ``size`` a call."""
-
-    def __init__(self, size: int = _LONGEST_CALL) -> None:
-        self.size = size
-        self._controls = np.zeros(size * _DEPARTURE_ROOM + _STAMPNS_SPACE, np.uint8)
-        self._views = [
-            self._controls[start : start + size * _DEPARTURE_ROOM].view(_DEPARTURE) for start in (0, _STAMPNS_SPACE)
-        ]
-        self._headers = np.zeros(size, _MMSGHDRS)
-        self._headers["control"] = _array_address(self._controls) + _DEPARTURE_ROOM * np.arange(size, dtype=np.uint64)
-        self._headers_at = ctypes.c_void_p(_array_address(self._headers))
-
-    def read(self, fd: int) -> tuple[NDArray[np.uint32], NDArray[np.int64], bool]:
-        """(ids, UTC ns, whether more may wait), in the order of the queue.
-
-        What else is in the queue, such as errors that the network has reported, is taken and ignored.
-        """
-        assert _libc is not None
-        self._headers["controllen"] = _DEPARTURE_ROOM  # the kernel overwrites it
-        count = max(_libc.recvmmsg(fd, self._headers_at, self.size, _MSG_ERRQUEUE | _MSG_DONTWAIT, None), 0)
-        found: tuple[NDArray[np.uint32], NDArray[np.int64]] | None = None
-        for view in self._views:
-            rows = view[:count]
-            good = (
-                (rows["kind"] == SO_TIMESTAMPING)
-                & (rows["level"] == _SOL_SOCKET)
-                & (rows["errno"] == errno.ENOMSG)
-                & (rows["origin"] == _ORIGIN_TIMESTAMPING)
-                & (rows["info"] == _TSTAMP_SND)
-            )
-            if good.any():  # of one socket all have the same form
-                rows = rows[good]
-                found = rows["id"].copy(), rows["seconds"] * _NS + rows["nanoseconds"]
-                break
-        ids, stamps_ns = found or (np.zeros(0, np.uint32), np.zeros(0, np.int64))
-        return ids, stamps_ns, count == self.size

@@ -15,7 +15,7 @@ LAYERS = [
     # ground floor, lowest first
     ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws"],
     ["pmutools.linux", "pmutools.parsers"],
-    ["pmutools.clock", "pmutools.realtime", "pmutools.settings"],
+    ["pmutools.clock", "pmutools.linux_columns", "pmutools.realtime", "pmutools.settings"],
     ["pmutools.pacing"],
     # the codec, sans-I/O
     ["pmutools.c37118"],

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pmutools import linux
+from pmutools.linux_columns import SendColumns
 from pmutools.net.sockets import Address, pack_sockaddr, unpack_sockaddr
 
 native = pytest.mark.skipif(not linux.NATIVE, reason="needs 64-bit Linux")
@@ -173,9 +174,9 @@ def test_a_failed_datagram_is_named_and_the_rest_go_out() -> None:
     sender.close()
 
 
-def _columns(frames: list[bytes], where: list[linux.SockAddr | None]) -> linux.SendColumns:
+def _columns(frames: list[bytes], where: list[linux.SockAddr | None]) -> SendColumns:
     sizes = np.array([len(frame) for frame in frames])
-    columns = linux.SendColumns(4)
+    columns = SendColumns(4)
     columns.load(
         np.frombuffer(b"".join(frames), np.uint8),
         np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from pmutools import linux
 from pmutools.flow import Segmentation
+from pmutools.linux_columns import SendColumns
 from pmutools.net.udp import Target, UdpSocket
 
 I64 = npt.NDArray[np.int64]
@@ -70,7 +70,7 @@ class Outbox:
         self._frames: list[bytes] = []
         self._targets: list[Target] = []
         self._marks: list[int] = []
-        self._columns = linux.SendColumns() if sock.native else None
+        self._columns = SendColumns() if sock.native else None
         self._loaded: tuple[npt.NDArray[np.uint8], I64, I64, Addresses]
         self.departures = Departures(sock) if stamped and sock.stamp_departures() else None
 

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pmutools import linux
 from pmutools.errors import SettingsError
@@ -31,6 +31,9 @@ from pmutools.net.sockets import (
     stamp_arrivals,
     unpack_sockaddr,
 )
+
+if TYPE_CHECKING:
+    from pmutools.linux_columns import DepartureBatch
 
 READ_BATCHES = 4
 """Batches taken from one socket before the others have their turn."""
@@ -57,12 +60,14 @@ class Batches:
     def __init__(self) -> None:
         self.receive = linux.ReceiveBatch()
         self.send = linux.SendBatch()
-        self._departures: linux.DepartureBatch | None = None
+        self._departures: DepartureBatch | None = None
 
     @property
-    def departures(self) -> linux.DepartureBatch:
+    def departures(self) -> DepartureBatch:
         if self._departures is None:  # few need it
-            self._departures = linux.DepartureBatch()
+            from pmutools.linux_columns import DepartureBatch
+
+            self._departures = DepartureBatch()
         return self._departures
 
 
