@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.controlled import FakePlayer, player_status, stream_status
 
 from pmutools.cli.play_keys import KEYS, Prompt, Step, Ui, decode, foreseen, pattern, press
-from pmutools.impair.profile import Action
+from pmutools.impair.profile import parse_action
 from pmutools.tools.player.control import parse_control
 from pmutools.tools.player.status import PlayState
 
@@ -150,11 +150,11 @@ def test_a_pattern_is_of_one_stream(name: str) -> None:
 
 
 def test_what_is_foreseen() -> None:
-    assert foreseen(PLAYING, Action("seek", argument="3")).position_s == 3
-    assert foreseen(PLAYING, Action("seek", argument="2016-09-08T17:05:11Z")) == PLAYING
-    assert foreseen(PLAYING, Action("speed", argument="2")).speed == 2
-    assert foreseen(PAUSED, Action("resume")) == PLAYING
-    assert foreseen(PAUSED, Action("loop", argument="off")) == PAUSED
+    assert foreseen(PLAYING, parse_action("seek 3")).position_s == 3
+    assert foreseen(PLAYING, parse_action("seek 2016-09-08T17:05:11Z")) == PLAYING
+    assert foreseen(PLAYING, parse_action("speed 2")).speed == 2
+    assert foreseen(PAUSED, parse_action("resume")) == PLAYING
+    assert foreseen(PAUSED, parse_action("loop off")) == PAUSED
 
 
 # --- bytes
