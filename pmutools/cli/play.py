@@ -55,8 +55,10 @@ def _faults(function: F) -> F:
 
 
 def _speed(text: str) -> Fraction:
+    from pmutools.impair.verbs import SPEED_DENOMINATOR
+
     parsers.number(0.001, 1000)(text)
-    return Fraction(text.strip()).limit_denominator(1_000_000)
+    return Fraction(text.strip()).limit_denominator(SPEED_DENOMINATOR)
 
 
 def _pair(text: str) -> tuple[str, str]:

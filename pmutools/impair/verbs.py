@@ -64,7 +64,7 @@ def _seek(words: Sequence[str]) -> Values:
 
 def _factor(words: Sequence[str]) -> Values:
     _speed(words[0])
-    return (Fraction(words[0]),)
+    return (Fraction(words[0]).limit_denominator(SPEED_DENOMINATOR),)
 
 
 def _loop(words: Sequence[str]) -> Values:
@@ -93,6 +93,8 @@ class Verb(NamedTuple):
     """Why a timeline cannot have it."""
 
 
+SPEED_DENOMINATOR = 1_000_000
+"""A speed is the nearest fraction with no greater one: deadlines are computed in 64 bits."""
 _STILL = "stream time stands still in a pause, so it would never come; write 'pause SECONDS', which ends by itself"
 PLAYER: dict[str, Verb] = {
     "pause": Verb("pause [SECONDS]", 0, 1, _pause),
