@@ -121,7 +121,9 @@ def test_streams_are_counted_apart_and_together(sheets: list[list[tuple[int, int
     miss_ns = [10, 10**6, 10**9]
     lateness = Lateness(miss_ns)
     for sheet in sheets:
-        streams, late_ns = (np.array(column, np.int64) for column in zip(*sheet, strict=True)) if sheet else (_NONE,) * 2
+        streams, late_ns = (
+            (np.array(column, np.int64) for column in zip(*sheet, strict=True)) if sheet else (_NONE,) * 2
+        )
         lateness.add(streams, late_ns)
     rows = [row for sheet in sheets for row in sheet]
     for stream in range(3):

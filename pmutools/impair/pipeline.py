@@ -30,8 +30,9 @@ from pmutools.impair.grammar import named_parts
 from pmutools.impair.moment import CONTROL_LANE, Moment, Original
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.profile import STREAM_VERBS, Action, Profile, StreamRule, Treatment
-from pmutools.impair.stages import OPTIONS, Stages
+from pmutools.impair.stages import OPTIONS, Setting, Stages
 from pmutools.impair.transmission import NO_DELAY, Transmission
+from pmutools.timebase import NS
 
 _TYPES = (*FrameType, FrameType.COMMAND, FrameType.COMMAND)
 """By bits 6-4 of SYNC; the two undefined values pass as commands."""
@@ -173,6 +174,26 @@ class Pipeline:
         self._config = config
         self._fresh = self._notice = True
         self._build(self._treatment, ("corrupt", "config"))
+
+    def adapt(self, config: StreamConfig) -> list[str]:
+        """As :meth:`configure`, but gives up faults that frames of this layout cannot have, and says which."""
+        given_up, treatment = [], self._treatment
+        for option in OPTIONS:
+            try:
+                self._check(Treatment(Stages(**{option: getattr(treatment.stages, option)})), (), config)
+            except SettingsError as error:
+                given_up.append(f"{error}; {option} ends here")
+                treatment = treatment._replace(stages=treatment.stages.changed(option, Setting(())))
+        for action in tuple(self._actions):
+            try:
+                self._check(Treatment(), (action,), config)
+            except SettingsError as error:
+                given_up.append(f"{error}; what was to begin at {action.at_ns / NS:g} s does not")
+                self._actions.remove(action)
+        if given_up:
+            self._build(treatment, OPTIONS)
+        self.configure(config)
+        return given_up
 
     def apply(
         self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None, *, stamp_ns: int | None = None

@@ -78,6 +78,7 @@ class Senders:
         self.reactor = self._reactor = Reactor(clock)
         self._audience = Audience()
         self._events: list[ServerEvent] = []
+        self._interrupted = False
         self._dirty: list[Flushable] = []
         self._stage = Stage(
             self._reactor, self._audience, self._events.append, self._dirty, self._box, self._batches, native
@@ -88,7 +89,6 @@ class Senders:
         self._spontaneous: list[list[UdpSink]] = []
         self._table: Table | None = None
         self._last_poll_ns = 0
-        self._woken = False
         self._share = 0
         if cfg_period_ns is not None:
             self._share_ns = max(cfg_period_ns // _SHARES, 1)
@@ -245,23 +245,23 @@ class Senders:
         return events
 
     def serve_until(self, deadline_ns: int) -> list[ServerEvent]:
-        """Answer clients until the monotonic clock reads ``deadline_ns``; back earlier only with events, or woken.
+        """Answer clients until the monotonic clock reads ``deadline_ns``; back earlier with events, or interrupted.
 
         The last milliseconds are an exact sleep, so clients wait that long for an answer. Where deadlines follow each
         other closely, sockets are looked at every few milliseconds.
         """
         while (left_ns := deadline_ns - self._clock.monotonic_ns()) > COARSE_NS:
-            if (events := self.poll(left_ns - COARSE_NS)) or self._woken:
-                self._woken = False
+            if (events := self.poll(left_ns - COARSE_NS)) or self._interrupted:
+                self._interrupted = False
                 return events
         if self._clock.monotonic_ns() - self._last_poll_ns > 2 * COARSE_NS and (events := self.poll(0)):
             return events
         self._clock.sleep_until(deadline_ns)
         return []
 
-    def wake(self) -> None:
-        """Have :meth:`serve_until` come back early, from a handler that it has called: there is something else to do."""
-        self._woken = True
+    def interrupt(self) -> None:
+        """Have :meth:`serve_until` return as soon as what is being answered is: for those who are called meanwhile."""
+        self._interrupted = True
 
     def disconnect(self, outlet: int, *, reset: bool = False) -> None:
         """Send all TCP clients of an outlet away, with FIN or with RST; they may come back."""

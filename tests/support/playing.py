@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from pmutools.c37118.session import Outcome, Served
 from pmutools.clock import VirtualClock
 from pmutools.flow import Flow, Hangup, StampSource
 from pmutools.formats.source import gather
-from pmutools.impair.profile import Profile, profile_of_options
+from pmutools.impair.profile import Profile, parse_action, profile_of_options
 from pmutools.net.cargo import Frames
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.net.outlet import ServerEvent
@@ -35,7 +36,7 @@ from pmutools.timebase import NS, from_ns, slot_time_ns, to_ns
 from pmutools.tools.player.cast import Cast, as_recorded
 from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
-from pmutools.tools.player.reel import I64, Reel, at_interval, at_rate, record
+from pmutools.tools.player.reel import I64, Reel, at_interval, at_rate, record, without_gaps
 from pmutools.tools.player.stamps import StampPolicy
 from pmutools.tools.window import Window
 
@@ -142,6 +143,8 @@ class Stage:
     offered: list[Served] = field(default_factory=list)
     announced: list[tuple[int, int]] = field(default_factory=list)
     gates: list[tuple[int, int, Hangup | None]] = field(default_factory=list)
+    orders: dict[int, Callable[[], object]] = field(default_factory=dict)
+    """What is done at which time (ns from the making), amid the waiting, as a control client does it."""
     closed: bool = False
     queued_bytes: int = 0
     cost_ns: int = 0
@@ -201,16 +204,19 @@ class Stage:
     def take_up(self, handle: int) -> None:
         self.gates.append((self.now_ns, handle, None))
 
-    def wake(self) -> None:
-        """Nobody is asleep in virtual time."""
-
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         return self.serve_until(self.clock.monotonic_ns() + (timeout_ns or 0))
 
     def serve_until(self, deadline_ns: int) -> list[ServerEvent]:
-        due = sorted(at for at in self.plays if self.zero_ns + at <= deadline_ns)
+        due = sorted(at for at in (*self.plays, *self.orders) if self.zero_ns + at <= deadline_ns)
         self.clock.sleep_until(self.zero_ns + due[0] if due else deadline_ns)
+        if due and due[0] in self.orders:
+            self.orders.pop(due[0])()
+            return []
         return [self.plays.pop(due[0])] if due else []
+
+    def interrupt(self) -> None:
+        """It returns from waiting after each order anyway."""
 
     def close(self) -> None:
         self.closed = True
@@ -234,6 +240,7 @@ class Played:
     player: Player
     began_ns: int
     """UTC when it began."""
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def reel(self) -> Reel:
@@ -285,26 +292,43 @@ def play(
     cast: Callable[[Reel], Cast] = as_recorded,
     ledger: Path | None = None,
     stop: Callable[[], bool] = lambda: False,
+    orders: Mapping[int, str | Callable[[Player], object]] | None = None,
+    skip_gaps_ns: int | None = None,
     **options: Any,
 ) -> Played:
-    """Play ``messages`` to the end; ``options`` are those of :class:`Options`, ``policy`` and ``speed`` as text."""
+    """Play ``messages`` to the end; ``options`` are those of :class:`Options`, ``policy`` and ``speed`` as text.
+
+    ``orders`` are given to the player at these times, ns from the beginning; those of one time on lines of their own;
+    or something is done with it.
+    """
     clock = clock or VirtualClock()
     stage = stage or Stage(clock)
     reel = reel_of(messages, timing, window, select, exclude)
+    if skip_gaps_ns is not None:
+        reel, _ = without_gaps(reel, skip_gaps_ns)
     if interval_ns is not None:
         reel = at_interval(reel, interval_ns)
     if fps is not None:
         reel = at_rate(reel, fps)
     chosen = Options(**({"to": [NOWHERE]} | options))
     chosen = replace(chosen, policy=StampPolicy(chosen.policy), speed=Fraction(chosen.speed))
-    began_ns = clock.realtime_ns()
-    with Player(cast(reel), chosen, clock, stop=stop, senders=stage) as player:  # type: ignore[arg-type]
+    began_ns, warnings = clock.realtime_ns(), list[str]()
+    with Player(cast(reel), chosen, clock, stop=stop, warn=warnings.append, senders=stage) as player:  # type: ignore[arg-type]
+
+        def obey(order: str | Callable[[Player], object]) -> None:
+            if callable(order):
+                order(player)
+                return
+            for line in order.splitlines():
+                player.act(parse_action(line))
+
+        stage.orders |= {at_ns: partial(obey, order) for at_ns, order in (orders or {}).items()}
         if ledger is None:
             player.play()
         else:
             with LedgerWriter(ledger) as rows:
                 player.play(rows)
-    return Played(player.cast, stage, player, began_ns)
+    return Played(player.cast, stage, player, began_ns, warnings)
 
 
 def config_of(sent: Sent) -> StreamConfig:

@@ -22,7 +22,7 @@ from pmutools.c37118.constants import NAME_SIZE
 from pmutools.errors import SettingsError
 from pmutools.parsers import bind, call, parsed_by
 from pmutools.timebase import NS
-from pmutools.tools.player.reel import I64, Reel, Track
+from pmutools.tools.player.reel import I64, Reel, Track, lengthened
 
 AHEAD_NS = 20_000_000
 """Frames are looked up this far ahead at once."""
@@ -93,7 +93,8 @@ class Cast:
         self._by_track = np.argsort(tracks, kind="stable").astype(np.int32)
         self._count = np.bincount(tracks, minlength=len(reel.tracks))
         self._first = np.concatenate(([0], np.cumsum(self._count)[:-1]))
-        self._latest_ns = int(self.phases.max())
+        self.latest_ns = int(self.phases.max())
+        """The greatest phase."""
         self._from_ns = self._to_ns = -1
         self._ahead = self._cut(-1, -1)
         self.editions = self.first_editions()
@@ -118,7 +119,7 @@ class Cast:
             ahead = self._ahead.position_ns
             if (place := int(ahead.searchsorted(low_ns))) < len(ahead):
                 return int(ahead[place])
-            row = int(due.searchsorted(zero_ns + self._to_ns - self._latest_ns))
+            row = int(due.searchsorted(zero_ns + self._to_ns - self.latest_ns))
             if row == len(due):
                 return None
             low_ns = max(self._to_ns, int(due[row]) - zero_ns)
@@ -129,7 +130,7 @@ class Cast:
 
     def _cut(self, low_ns: int, high_ns: int) -> Cut:
         due, zero_ns = self.reel.rows.due_ns, self.reel.first_due_ns
-        first, last = due.searchsorted((zero_ns + low_ns - self._latest_ns, zero_ns + high_ns))
+        first, last = due.searchsorted((zero_ns + low_ns - self.latest_ns, zero_ns + high_ns))
         rows = np.arange(first, last)
         tracks = self.reel.rows.track[first:last]
         if not self.emulated:
@@ -218,11 +219,18 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         track = reel.tracks[place]
         name = clone_name(track, number, count)
         idcode = (first - 1 + number) % IDCODES + 1
-        rate = Fraction(reel.fps) if reel.fps is not None else track.config.rate
-        phase_ns = int(NS / rate * number / count) if stagger and rate else 0
+        phase_ns = int(_period_ns(reel, track) * number / count) if stagger else 0
         part = Part(place, name, idcode, phase_ns, emulated=True)
         parts.append(_spread(part, spread, seed) if spread else part)
-    return Cast(reel, parts)
+    return Cast(lengthened(reel, max(part.phase_ns for part in parts)), parts)
+
+
+def _period_ns(reel: Reel, track: Track) -> Fraction:
+    """From one frame of a track to its next; 0 where no rate is known."""
+    if reel.interval_ns is not None:
+        return Fraction(reel.interval_ns)
+    rate = track.config.rate if reel.fps is None else Fraction(reel.fps)
+    return NS / rate if rate else Fraction(0)
 
 
 def clone_name(track: Track, number: int, count: int) -> str:

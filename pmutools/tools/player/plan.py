@@ -22,13 +22,13 @@ from pmutools.errors import SettingsError
 from pmutools.flow import Hangup
 from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
-from pmutools.impair.profile import Action, parse_action
+from pmutools.impair.profile import Action
 from pmutools.impair.verbs import Place
 from pmutools.pacing import Playback
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.dress import Dressed, dress
-from pmutools.tools.player.reel import I64
+from pmutools.tools.player.reel import I64, Reel
 from pmutools.tools.player.sheet import EMPTY, FATES, Extra, Sheet, clean, joined
 from pmutools.tools.player.stamps import StampPolicy, on_grid, shifted
 
@@ -88,10 +88,13 @@ class Plan:
         self._route = _Route(cast, pipelines, marks=marks)
         self._timeline = deque(timeline)
         self._totals = np.array([track.total for track in self._reel.tracks], np.int64)
+        self._period_ns = _period_ns(cast.reel)
         self._planned_ns = 0
         self._cursor_ns = 0
         self._loop = 0
         self._stop_ns: int | None = None
+        self._resumes_ns = 0
+        """When a pause for some time ends by itself."""
         self._waiting: dict[int, list[Sheet]] = {}
         self.between_ns: tuple[int, int] | None = None
         """Positions A and B of a loop within the recording."""
@@ -118,7 +121,8 @@ class Plan:
 
     @property
     def paused(self) -> bool:
-        return not self._playback.running
+        """Whether it waits to be told to go on, or is on its way there by steps."""
+        return not self._playback.running or self._stop_ns is not None
 
     def next_ns(self) -> int | None:
         """When something is to leave, or to be done, next; None while nothing is."""
@@ -167,10 +171,13 @@ class Plan:
             self._stop_ns = None
             self._playback = Playback(self._here_ns(), self._cursor_ns, self.speed, running=False)
         elif self._timeline and self._timeline[0].at_ns <= self._cursor_ns:
-            self.act(self._timeline.popleft(), self._here_ns())
+            self._follow(self._timeline.popleft())
         elif self.between_ns is not None and self.position_ns >= self.between_ns[1]:
             self._loop += 1
+            before_ns = self._cursor_ns
             self._go(self._here_ns(), self._round_start(self._loop) + self.between_ns[0])
+            if self._stop_ns is not None:
+                self._stop_ns += self._cursor_ns - before_ns
         elif self._cursor_ns >= self._round_end() and not self._last_round:
             self._loop += 1
         elif self._last_round and self.cast.next_position(self.position_ns) is None:
@@ -178,6 +185,13 @@ class Plan:
         else:
             return False
         return True
+
+    def _follow(self, action: Action) -> None:
+        """Do what the timeline says, if it can be done."""
+        try:
+            self.act(action, self._here_ns())
+        except SettingsError as error:
+            self._route.warnings.append(f"[at {action.at_ns / NS:g}] {action.verb} {action.argument}: {error}")
 
     @property
     def _last_round(self) -> bool:
@@ -276,63 +290,116 @@ class Plan:
     # --- being told
 
     def act(self, action: Action, offset_ns: int) -> None:
-        """Do a player's verb at ``offset_ns``, or as soon after what is planned already as can be."""
+        """Do a player's verb at ``offset_ns``, or as soon after what is planned already as can be.
+
+        Raises SettingsError for what the recording does not have.
+        """
         offset_ns = max(offset_ns, self._planned_ns)
+        self._catch_up(offset_ns)
         match action.verb, *action.values:
             case ["pause"]:
                 self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
+                self._stop_ns = None
             case ["pause", int(for_ns)]:
                 self._go(offset_ns + for_ns, self._cursor_ns)
+                self._stop_ns, self._resumes_ns = None, offset_ns + for_ns
             case ["resume"]:
-                if self.paused:
+                if self.paused or offset_ns < self._resumes_ns:
                     self._go(offset_ns, self._cursor_ns)
+                    self._stop_ns = None
             case ["step", int(count)]:
                 self._step(offset_ns, count)
             case ["speed", Fraction() as speed]:
-                self._playback = Playback(
-                    max(offset_ns, self._here_ns()) if self._playback.running else offset_ns,
-                    self._cursor_ns,
-                    speed,
-                    self._playback.running,
-                )
+                at_ns = self._here_ns() if self._playback.running else offset_ns
+                self._playback = Playback(at_ns, self._cursor_ns, speed, self._playback.running)
             case ["seek", Place() as place]:
                 self.seek(offset_ns, self._position(place))
             case ["loop"]:
                 self.between_ns = None
             case ["loop", Place() as a, Place() as b]:
-                first_ns, last_ns = self._position(a), self._position(b)
-                self.between_ns = (first_ns, last_ns)
-                if not first_ns <= self.position_ns < last_ns:
-                    self.seek(offset_ns, first_ns)
+                self._loop_between(offset_ns, self._position(a), self._position(b))
+
+    def _catch_up(self, offset_ns: int) -> None:
+        """Bring the cursor to where it is at ``offset_ns``, but not beyond what is to leave, or to be done, before."""
+        if not self._playback.running or self.ended:
+            return
+        stops = [self._playback.media_from(offset_ns), self._until_ns()]
+        if (position := self.cast.next_position(self.position_ns)) is not None:
+            stops.append(self._round_start(self._loop) + position)
+        self._cursor_ns = max(self._cursor_ns, min(stops))
+
+    def _loop_between(self, offset_ns: int, first_ns: int, last_ns: int) -> None:
+        """Play a part of the recording over and over; a part of less than a reporting interval is refused."""
+        last_ns = min(last_ns, self._round_end() - self._round_start(self._loop))
+        if last_ns - first_ns < round(self._period_ns):
+            raise SettingsError(
+                f"a loop from {first_ns / NS:g} s to {last_ns / NS:g} s is shorter than a reporting interval"
+                if last_ns > first_ns
+                else f"a loop from {first_ns / NS:g} s on: its end, or the recording's, is before it"
+            )
+        next_ns = self.cast.next_position(first_ns)
+        if next_ns is None or next_ns >= last_ns:
+            raise SettingsError(f"no frame is due between {first_ns / NS:g} s and {last_ns / NS:g} s")
+        self.between_ns = (first_ns, last_ns)
+        if not first_ns <= self.position_ns < last_ns:
+            self.seek(offset_ns, first_ns)
 
     def _position(self, place: Place) -> int:
-        """Within the recording."""
-        return place.ns if place.relative else place.ns - int(self._reel.rows.stamp_ns[0])
+        """Within the recording; of a UTC time that of the first frame of then, or after."""
+        if place.relative:
+            return place.ns
+        reel = self._reel
+        later = np.flatnonzero(reel.rows.source_ns >= place.ns)
+        if not len(later):
+            return reel.length_ns
+        due_ns, row = reel.rows.due_ns, int(later[0])
+        early_ns = int(due_ns[row]) - (int(reel.rows.source_ns[row]) - place.ns)
+        if row:
+            early_ns = min(max(early_ns, int(due_ns[row - 1]) + 1), int(due_ns[row]))
+        return early_ns - reel.first_due_ns
 
     def seek(self, offset_ns: int, position_ns: int) -> None:
         """Go to a position, in the present round; a paused player stays paused."""
-        running = self._playback.running
-        self.ended = False
+        running = not self.paused
+        self.ended, self._stop_ns = False, None
         position_ns = min(max(position_ns, 0), self._reel.length_ns)
         self._go(offset_ns, self._round_start(self._loop) + position_ns)
         if not running:
             self._playback = Playback(offset_ns, self._cursor_ns, self.speed, running=False)
 
     def _step(self, offset_ns: int, count: int) -> None:
-        position = self.cast.next_position(self.position_ns)
-        if position is None or self.ended:
+        """Play on for ``count`` reporting intervals; what is due within one, of all streams, is one instant."""
+        if self._stop_ns is not None:  # still on the way
+            self._stop_ns += int(self._period_ns * count)
             return
-        self._cursor_ns = self._round_start(self._loop) + position
-        rate = max((self._rate(edition) for edition in range(len(self._reel.editions))), default=Fraction(0)) or 1
-        self._stop_ns = self._cursor_ns + max(1, int(Fraction(NS) / rate * count - NS / rate / 2))
+        if not self._find_frame(offset_ns):
+            self._playback = replace(self._playback, running=False)
+            return
+        margin_ns = max(self._period_ns - self.cast.latest_ns, Fraction(0)) / 2
+        self._stop_ns = self._cursor_ns + max(1, int(self._period_ns * count - margin_ns))
         self._playback = Playback(offset_ns, self._cursor_ns, self.speed)
         if self.policy is StampPolicy.SHIFT:
             behind_ns = self.start_utc_ns + offset_ns - self._recorded_due_ns()
             self._shift_ns = behind_ns // NS * NS
 
+    def _find_frame(self, offset_ns: int) -> bool:
+        """Bring the cursor to the next frame, and do what is to be done before; false where there is none."""
+        while not self.ended:
+            position, until_ns = self.cast.next_position(self.position_ns), self._until_ns()
+            if position is not None and (stream_ns := self._round_start(self._loop) + position) < until_ns:
+                self._cursor_ns = stream_ns
+                return True
+            if position is None and self._last_round:
+                return False
+            self._cursor_ns = until_ns
+            self._playback = Playback(offset_ns, self._cursor_ns, self.speed)
+            if not self._turn():
+                return False
+        return False
+
     def _go(self, offset_ns: int, stream_ns: int) -> None:
         """Go on at ``stream_ns``, from ``offset_ns`` or as soon after it as the stamps allow."""
-        self._cursor_ns = stream_ns
+        self._cursor_ns, self._resumes_ns = stream_ns, 0
         at_ns = self._aligned(self.start_utc_ns + offset_ns) - self.start_utc_ns
         self._playback = Playback(at_ns, stream_ns, self.speed)
 
@@ -343,8 +410,11 @@ class Plan:
             self._shift_ns = -((due_ns - utc_ns) // NS) * NS
             return due_ns + self._shift_ns
         if self.policy is StampPolicy.NOW_GRID and (rate := self._rate(int(self._reel.rows.edition[0]))):
-            index = -(-utc_ns * rate.numerator // (rate.denominator * NS))
-            return timebase.slot_time_ns(index, rate)
+            position = self.cast.next_position(self.position_ns)
+            wait_ns = 0 if position is None else int((position - self.position_ns) / self.speed)
+            since_ns = utc_ns + wait_ns - self.start_utc_ns  # so offsets are the same whenever a run begins
+            index = -(-since_ns * rate.numerator // (rate.denominator * NS))
+            return self.start_utc_ns + timebase.slot_time_ns(index, rate) - wait_ns
         return utc_ns
 
     def _recorded_due_ns(self) -> int:
@@ -353,7 +423,7 @@ class Plan:
         row = min(int(np.searchsorted(reel.rows.due_ns, reel.first_due_ns + position_ns)), len(reel.rows) - 1)
         stamp_ns = int(shifted(reel.rows.stamp_ns[row : row + 1], reel, self._loop, 0)[0])
         due_ns = int(reel.rows.due_ns[row])
-        latency_ns = 0 if reel.spaced else due_ns - int(reel.rows.stamp_ns[row])
+        latency_ns = 0 if reel.interval_ns is not None else due_ns - int(reel.rows.stamp_ns[row])
         return stamp_ns + latency_ns - (due_ns - reel.first_due_ns - position_ns)
 
     # --- streams
@@ -371,6 +441,15 @@ class Plan:
     def fault(self, action: Action) -> list[int]:
         """Do a stream's verb, from the next planned frame on; gives the parts that it concerns."""
         return self._route.act(action)
+
+
+def _period_ns(reel: Reel) -> Fraction:
+    """The shortest time between two frames of a stream; a second where no rate is known."""
+    if reel.interval_ns is not None:
+        return Fraction(reel.interval_ns)
+    editions = [reel.editions[edition] for edition in np.unique(reel.rows.edition)]
+    rates = [Fraction(reel.fps)] if reel.fps is not None else [config.rate for config in editions]
+    return NS / (max(rates) or Fraction(1))
 
 
 # --- through the pipelines ------------------------------------------------------------------------------------------
@@ -397,7 +476,7 @@ class _Route:
             pipeline.check(action)
         concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
         for part in concerned:
-            self._mode[part] = _mode(self._pipelines[part])
+            self._set_mode(part)
         return concerned
 
     def through(
@@ -435,14 +514,12 @@ class _Route:
 
     def _configure(self, part: int, edition: int) -> None:
         self._edition[part] = edition
-        pipeline, config = self._pipelines[part], self._cast.config(part, edition)
-        try:
-            pipeline.configure(config)
-        except SettingsError as error:
-            self.warnings.append(f"{error}; from here on this stream has no content faults")
-            pipeline.act(_NO_CONTENT)
-            pipeline.configure(config)
-        self._mode[part] = _mode(self._pipelines[part])
+        self.warnings += self._pipelines[part].adapt(self._cast.config(part, edition))
+        self._set_mode(part)
+
+    def _set_mode(self, part: int) -> None:
+        """How frames of ``part`` pass; one by one too until clients that were hung up on may come back."""
+        self._mode[part] = _BUSY if self._hung.get(part) is not None else _mode(self._pipelines[part])
 
     def _faulty(self, sheet: Sheet, stream_ns: I64) -> Sheet:
         modes = self._mode[sheet.part]
@@ -490,7 +567,7 @@ class _Route:
                 pipeline.refused.clear()
             if not pipeline.holding:
                 origins.clear()
-                self._mode[part] = _mode(pipeline)
+                self._set_mode(part)
         return self._sheet(out)
 
     def _take(self, part: int, done: Sequence[Outgoing], out: list[tuple[int, Outgoing, _Origin]]) -> None:
@@ -539,9 +616,6 @@ def _extra(copy: Outgoing) -> Extra | None:
 
 
 _ORDINARY = Extra()
-
-
-_NO_CONTENT = parse_action("fault * corrupt=none")
 
 
 def _mode(pipeline: Pipeline) -> int:

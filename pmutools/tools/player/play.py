@@ -174,7 +174,10 @@ class Player:
         )
         self._state = PlayState.PLAYING
         for action in self._actions:
-            self._do(action)
+            try:
+                self._do(action)
+            except SettingsError as error:
+                self._warn(f"{action.verb} {action.argument}: {error}")
         self._actions.clear()
         self.senders.announce()
         going = self._run(plan, delivery, end_ns, self._watch(utc, progress))
@@ -188,7 +191,7 @@ class Player:
         """Send the plan; false if told to stop before its end."""
         clock = self.clock
         last_ns = None if end_ns is None else end_ns - self._anchor_ns
-        sheet_ns = self._sheet_ns()
+        rate = self._frames_planned_per_s()
         while True:
             watch()
             next_ns = plan.next_ns()
@@ -202,7 +205,7 @@ class Player:
                 if not self._serve_until(self._anchor_ns + next_ns - LEAD_NS, once=True):
                     return False
                 continue
-            until_ns = next_ns + sheet_ns
+            until_ns = next_ns + _sheet_ns(rate * float(plan.speed))
             sheet = plan.until(until_ns if last_ns is None else min(until_ns, last_ns))
             for warning in plan.warnings():
                 self._warn(warning)
@@ -217,10 +220,9 @@ class Player:
             if not delivery.send(sheet, self._anchor_ns, self._serve_until):
                 return False
 
-    def _sheet_ns(self) -> int:
-        rates = [self.cast.config(part, int(edition)).rate for part, edition in enumerate(self.cast.editions)]
-        total = sum(map(float, rates)) * float(self.options.speed)
-        return int(min(SHEET_NS, max(1_000_000, SHEET_FRAMES / total * NS))) if total else SHEET_NS
+    def _frames_planned_per_s(self) -> float:
+        """At speed 1."""
+        return sum(float(self.cast.config(part, int(e)).rate) for part, e in enumerate(self.cast.editions))
 
     def _watch(self, utc: UtcOffset, progress: Callable[[], None]) -> Callable[[], None]:
         """What is to be looked at about once a second: progress, rates, and whether UTC was stepped."""
@@ -302,10 +304,13 @@ class Player:
                 )
         elif action.verb == "step" and not (self._plan is not None and self._plan.paused):
             raise SettingsError("step goes on by frames from a pause; pause first")
-        if self._plan is None:
-            self._actions.append(action)
-        else:
+        if self._plan is not None:
             self._do(action)
+            self.senders.interrupt()  # something may be due before what is waited for
+            return
+        for pipeline in self.pipelines:
+            pipeline.check(action)
+        self._actions.append(action)
 
     def _do(self, action: Action) -> None:
         assert self._plan is not None
@@ -313,7 +318,6 @@ class Player:
             self._plan.fault(action)
         else:
             self._plan.act(action, self.clock.monotonic_ns() - self._anchor_ns)
-            self.senders.wake()
 
     def status(self) -> PlayerStatus:
         """What it is doing now."""
@@ -379,6 +383,10 @@ class _Statuses(Sequence[StreamStatus]):
         if isinstance(places, int):
             return self._player.stream_status(places)
         return [self._player.stream_status(part) for part in places]
+
+
+def _sheet_ns(frames_per_s: float) -> int:
+    return int(min(SHEET_NS, max(1_000_000, SHEET_FRAMES / frames_per_s * NS))) if frames_per_s else SHEET_NS
 
 
 def _offer(cast: Cast, part: int, edition: int) -> Served:

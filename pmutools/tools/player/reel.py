@@ -104,8 +104,8 @@ class Reel:
     fps: int | None = None
     """Stamps are not as recorded but consecutive reporting instants of this rate, ``round_slots`` of them a round."""
     round_slots: int = 0
-    spaced: bool = False
-    """Due times have nothing to do with stamps."""
+    interval_ns: int | None = None
+    """Due times have nothing to do with stamps: each track's are so far apart."""
     sizes: npt.NDArray[np.int64] = field(init=False)
     """FRAMESIZE by edition."""
     time_bases: npt.NDArray[np.int64] = field(init=False)
@@ -277,8 +277,16 @@ def without_gaps(reel: Reel, longest_ns: int) -> tuple[Reel, int]:
         return reel, 0
     moved = np.concatenate(([0], np.cumsum(cut)))
     rows = replace(rows, due_ns=rows.due_ns - moved, stamp_ns=rows.stamp_ns - moved)
+    tracks = tuple(_retimed(track, rows[rows.track == place]) for place, track in enumerate(reel.tracks))
     seconds = _whole_seconds(int(rows.due_ns[-1] - rows.due_ns[0]) + _period_ns(reel.tracks))
-    return replace(reel, rows=rows, round_ns=Fraction(seconds), round_stamp_ns=seconds), int(np.count_nonzero(cut))
+    cuts = int(np.count_nonzero(cut))
+    return replace(reel, tracks=tracks, rows=rows, round_ns=Fraction(seconds), round_stamp_ns=seconds), cuts
+
+
+def _retimed(track: Track, rows: Rows) -> Track:
+    retimed = replace(track, frames=0, first_ns=FOREVER, last_ns=-FOREVER, first_due_ns=FOREVER, last_due_ns=-FOREVER)
+    retimed.add(rows.stamp_ns, rows.due_ns)
+    return retimed
 
 
 def at_interval(reel: Reel, interval_ns: int) -> Reel:
@@ -287,7 +295,8 @@ def at_interval(reel: Reel, interval_ns: int) -> Reel:
     starts = np.array([track.first_due_ns for track in reel.tracks], np.int64)
     due = starts[reel.rows.track] + place * interval_ns
     lasts = [t.first_due_ns - reel.first_due_ns + t.frames * interval_ns for t in reel.tracks]
-    return replace(reel, rows=_sorted(replace(reel.rows, due_ns=due)), round_ns=Fraction(max(lasts)), spaced=True)
+    rows = _sorted(replace(reel.rows, due_ns=due))
+    return replace(reel, rows=rows, round_ns=Fraction(max(lasts)), interval_ns=interval_ns)
 
 
 def at_rate(reel: Reel, fps: int) -> Reel:
@@ -305,7 +314,18 @@ def at_rate(reel: Reel, fps: int) -> Reel:
     rows = _sorted(replace(reel.rows, due_ns=due, stamp_ns=stamps))
     intervals = max(int(later[k]) + track.frames for k, track in enumerate(reel.tracks))
     round_ns = Fraction(intervals * NS, fps)
-    return replace(reel, rows=rows, round_ns=round_ns, fps=fps, round_slots=intervals)
+    return lengthened(replace(reel, rows=rows, round_ns=round_ns, fps=fps, round_slots=intervals), 0)
+
+
+def lengthened(reel: Reel, later_ns: int) -> Reel:
+    """With rounds that are not over before a frame ``later_ns`` after the last row: one with a great latency, say."""
+    last_ns = reel.length_ns + later_ns
+    if last_ns < reel.round_ns:
+        return reel
+    if reel.fps is None:
+        return replace(reel, round_ns=Fraction(last_ns + 1))
+    slots = last_ns * reel.fps // NS + 1
+    return replace(reel, round_ns=Fraction(slots * NS, reel.fps), round_slots=slots)
 
 
 def slot_times(slots: I64, fps: int) -> I64:
