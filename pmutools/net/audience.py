@@ -17,6 +17,7 @@ I64 = npt.NDArray[np.int64]
 NO_ROW = -1
 _REMEMBERED = 1 << 18
 """Datagrams whose departure stamps are waited for: two seconds of 100,000/s."""
+_NONE = np.zeros(0, np.int64)
 
 
 class Sink(Protocol):
@@ -127,22 +128,32 @@ class Departures:
         self._sock = sock
         self._marks = np.full(_REMEMBERED, NO_ROW, np.int64)
         self._next = 0
+        self._found: list[tuple[I64, I64]] = []
 
     def sent(self, marks: I64, failed: Sequence[int]) -> None:
         """Datagrams were handed to the kernel, those of ``marks`` in this order."""
         if failed:  # whether those were counted depends on where they failed: begin a new count
+            self.collect()
             self._sock.restart_departures()
             self._marks[:], self._next = NO_ROW, 0
             return
         self._marks[(self._next + np.arange(len(marks))) % _REMEMBERED] = marks
         self._next = self._next + len(marks) & 0xFFFF_FFFF
 
+    def collect(self) -> None:
+        """Take what has come off the socket: while any stamps wait there, a selector finds it ready."""
+        if stamps := self._sock.departures():
+            found = np.array(stamps, np.int64)
+            marks = self._marks[found[:, 0] % _REMEMBERED]
+            known = marks != NO_ROW
+            self._found.append((marks[known], found[known, 1]))
+
     def read(self) -> tuple[I64, I64]:
-        """(mark, POSIX UTC ns) of the stamps that have come; marks below 0 are of frames nobody asks for."""
-        found = np.array(self._sock.departures(), np.int64).reshape(-1, 2)
-        marks = self._marks[found[:, 0] % _REMEMBERED]
-        known = marks != NO_ROW
-        return marks[known], found[known, 1]
+        """(mark, POSIX UTC ns) of the stamps that have come since this was last asked."""
+        self.collect()
+        marks, times = zip((_NONE, _NONE), *self._found, strict=True)
+        self._found.clear()
+        return np.concatenate(marks), np.concatenate(times)
 
 
 class UdpSink:

@@ -83,6 +83,8 @@ class Stage(NamedTuple):
     """The box of the socket that sends to an address, in the way an endpoint asks for."""
     batches: Batches | None
     native: bool = linux.NATIVE
+    stamped: bool = False
+    """Whether departures are stamped."""
 
 
 # --- clients -----------------------------------------------------------------------------------------------------
@@ -246,7 +248,7 @@ class UdpOutlet(Outlet):
         super().__init__(index, endpoint, streams, handles, stage)
         self._sock = UdpSocket(endpoint.host, endpoint.port, batches=stage.batches, native=stage.native)
         self.address = self._sock.address
-        self._outbox = Outbox(self._sock, stage.dirty)
+        self.outbox = Outbox(self._sock, stage.dirty, stamped=stage.stamped)
         self._unheard: Iterator[tuple[str, bytes]] = iter(())
         """(source, command) of the datagrams last read that wait for their turn."""
         self._clients: dict[str, _UdpClient] = {}
@@ -261,6 +263,8 @@ class UdpOutlet(Outlet):
         """Nothing: clients of UDP cannot be seen to stall."""
 
     def _ready(self, _events: int) -> None:
+        if self.outbox.departures is not None:  # stamps that wait make the socket ready, too
+            self.outbox.departures.collect()
         heard = list(islice(self._unheard, COMMANDS))
         if not heard:  # all before is done
             self._read()
@@ -269,7 +273,7 @@ class UdpOutlet(Outlet):
             self._hear(source, frame)
         if len(heard) == COMMANDS:
             self.stage.reactor.again(self._sock, READ)
-        self._outbox.flush()
+        self.outbox.flush()
 
     def _read(self) -> None:
         try:
@@ -281,7 +285,7 @@ class UdpOutlet(Outlet):
     def _hear(self, source: str, frame: bytes) -> None:
         client = self._clients.pop(source, None) or self._stranger(source)
         if (answer := self._obey(client, frame)) is not None:
-            self._outbox.put(answer, client.where, 0)
+            self.outbox.put(answer, client.where, 0)
         if client.role.started:
             self._clients[source] = client
         while len(self._clients) > MAX_CLIENTS:
@@ -292,7 +296,7 @@ class UdpOutlet(Outlet):
     def _stranger(self, source: str) -> _UdpClient:
         host, _, port = source.rpartition(":")
         address = resolve(host.strip("[]"), int(port), datagram=True, family=self.address.family)
-        return _UdpClient(address, ServerRole(self.streams), source, self._outbox)
+        return _UdpClient(address, ServerRole(self.streams), source, self.outbox)
 
 
 class TcpOutlet(Outlet):

@@ -81,7 +81,14 @@ class Senders:
         self._interrupted = False
         self._dirty: list[Flushable] = []
         self._stage = Stage(
-            self._reactor, self._audience, self._events.append, self._dirty, self._box, self._batches, native
+            self._reactor,
+            self._audience,
+            self._events.append,
+            self._dirty,
+            self._box,
+            self._batches,
+            native,
+            stamp_departures,
         )
         self._served: list[Served] = []
         self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
@@ -220,7 +227,8 @@ class Senders:
 
     def departures(self) -> tuple[I64, I64]:
         """(mark, POSIX UTC ns) of frames whose departure the kernel has stamped since this was last asked."""
-        found = [box.departures.read() for box in self._boxes.values() if box.departures is not None]
+        outboxes = [outlet.outbox for _, outlet in self._outlets if isinstance(outlet, UdpOutlet)]
+        found = [box.departures.read() for box in (*self._boxes.values(), *outboxes) if box.departures is not None]
         marks, times = zip(*found, strict=True) if found else ((), ())
         return np.concatenate([_NONE, *marks]), np.concatenate([_NONE, *times])
 

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from support.live import CLOCK, PATIENCE_NS, Ear, data_frame, free_udp_port, stream, values
 
@@ -24,6 +25,7 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Cut, Hangup, Segmentation
 from pmutools.net import outlet as outlet_module
 from pmutools.net import tcp
+from pmutools.net.cargo import Frames
 from pmutools.net.dialogue import LinkKind
 from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
 from pmutools.net.outlet import ServerEvent, ServerKind
@@ -642,6 +644,53 @@ def test_a_port_taken_meanwhile_is_told_and_had_back_later(monkeypatch: pytest.M
         server.until(lambda: not refuses(server))
         with clients(server, 1) as (client,):
             started(server, client)
+
+
+# --- departures
+
+
+def sent_now(senders: Senders, handle: int, marks: range) -> list[int]:
+    """Send so many frames; returns the rows that failed."""
+    data = data_frame(stream(), 10**9)
+    starts = np.arange(len(marks)) * len(data)
+    frames = Frames(
+        np.full(len(marks), handle),
+        starts,
+        np.full(len(marks), len(data)),
+        np.frombuffer(data * len(marks), np.uint8),
+        np.ones(len(marks), np.bool_),
+        np.array(marks),
+    )
+    return senders.send(senders.load(frames), 0, len(marks))
+
+
+@pytest.mark.skipif(not linux.NATIVE, reason="only Linux stamps departures")
+def test_departures_to_clients_that_ask_over_udp_are_stamped_too() -> None:
+    with serving("udp+cmd://127.0.0.1:0", stream(), stamp_departures=True) as server:
+        senders = server.senders
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.sendto(START, server.address)
+            server.until(lambda: Outcome.STARTED in server.kinds())
+            before_ns = time.time_ns()
+            assert sent_now(senders, 0, range(100, 110)) == []
+            marks, times = senders.departures()
+        assert marks.tolist() == [*range(100, 110)]
+        assert before_ns <= times.min() <= times.max() <= time.time_ns()
+        senders.poll(0)
+        assert senders.departures()[0].tolist() == [], "each is told once"
+
+
+@pytest.mark.skipif(not linux.NATIVE, reason="only Linux stamps departures")
+def test_stamps_of_what_left_before_a_failed_send_are_not_lost() -> None:
+    """The kernel's numbers begin anew there."""
+    too_long = b"\0" * 70_000
+    with Senders(CLOCK, stamp_departures=True) as senders:
+        handle = senders.add(served(stream()))
+        senders.send_to(parse_endpoint(f"udp://127.0.0.1:{free_udp_port()}"), [handle])
+        sent_now(senders, handle, range(5))
+        assert senders.publish([(handle, too_long)]) == [0]
+        sent_now(senders, handle, range(10, 13))
+        assert senders.departures()[0].tolist() == [*range(5), 10, 11, 12]
 
 
 # --- spontaneous
