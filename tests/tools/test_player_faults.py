@@ -6,10 +6,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.playing import (
     MS,
     START_NS,
+    Loaded,
     Played,
     Stage,
     config_of,
@@ -27,6 +29,7 @@ from pmutools.c37118.checksum import chk
 from pmutools.clock import VirtualClock
 from pmutools.impair.outgoing import UNREPEATABLE, LedgerRow
 from pmutools.impair.profile import Profile, parse_profile
+from pmutools.net.cargo import I64, Frames
 from pmutools.tools.window import Window, parse_moment
 
 Row = dict[str, Any]
@@ -224,6 +227,25 @@ def test_a_frame_has_failed_if_no_destination_took_it(tmp_path: Path) -> None:
     _, rows = with_ledger(tmp_path, recording(stream(), 20), clock=clock, stage=stage)
     assert [row["index"] for row in rows if row["fate"] == "failed"] == [9]
     assert [row["index"] for row in rows if row["sent_ns"] is None] == [9]
+
+
+class Tardy(Stage):
+    """Its kernel stamps what has left only some time after the call."""
+
+    def load(self, frames: Frames) -> Loaded:
+        self.loaded = [*getattr(self, "loaded", []), *frames.marks.tolist()]
+        return super().load(frames)
+
+    def departures(self) -> tuple[I64, I64]:
+        ready, self.ready = getattr(self, "ready", []), self.loaded
+        self.loaded = []
+        return np.array(ready, np.int64), np.full(len(ready), 17, np.int64)
+
+
+def test_stamps_of_departures_that_come_at_the_very_end_are_in_the_ledger(tmp_path: Path) -> None:
+    clock = VirtualClock()
+    _, rows = with_ledger(tmp_path, recording(stream(), 20), clock=clock, stage=Tardy(clock))
+    assert [row["tx_stamp_ns"] for row in rows] == [17] * 20
 
 
 # --- configurations

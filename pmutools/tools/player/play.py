@@ -186,6 +186,8 @@ class Player:
             self._drain()
         elif going and end_ns is not None:  # the end was asked for in time, not in frames
             self._serve_until(end_ns)
+        if ledger is not None:
+            ledger.stamp(*self.senders.departures())
 
     def _run(self, plan: Plan, delivery: Delivery, end_ns: int | None, watch: Callable[[], None]) -> bool:
         """Send the plan; false if told to stop before its end."""
