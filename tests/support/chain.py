@@ -43,10 +43,15 @@ class EarlyClock(SystemClock):
 
     def __init__(self, first_due_ns: int) -> None:
         super().__init__()
-        self._moved_ns = (first_due_ns - _LEAD_NS - super().realtime_ns()) % NS
+        self.moved_ns = 0
+        self.be_early(first_due_ns, _LEAD_NS)
+
+    def be_early(self, first_due_ns: int, lead_ns: int) -> None:
+        """Move UTC so that what is due at ``first_due_ns``, give or take whole seconds, is due in ``lead_ns``."""
+        self.moved_ns = (first_due_ns - lead_ns - super().realtime_ns()) % NS
 
     def realtime_ns(self) -> int:
-        return super().realtime_ns() + self._moved_ns
+        return super().realtime_ns() + self.moved_ns
 
 
 @contextmanager
