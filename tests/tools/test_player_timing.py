@@ -24,6 +24,7 @@ from support.playing import (
 )
 
 from pmutools.c37118 import FrameType, decode_config, decode_prefix
+from pmutools.c37118.checksum import chk
 from pmutools.c37118.session import Served
 from pmutools.clock import VirtualClock
 from pmutools.errors import SettingsError, SourceError
@@ -32,7 +33,7 @@ from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.pacing import Playback
 from pmutools.timebase import NS, slot, slot_time_ns
-from pmutools.tools.player.cast import as_recorded
+from pmutools.tools.player.cast import Spread, as_recorded, emulated
 from pmutools.tools.player.plan import Plan
 from pmutools.tools.player.stamps import StampPolicy
 from pmutools.tools.window import Window, parse_moment
@@ -400,3 +401,24 @@ def test_a_waiting_player_told_to_stop_does_so() -> None:
     stage = Stage(timing)
     play(recording(stream(), 5), clock=timing, stage=stage, to=[], listen=[LISTEN], stop=lambda: stage.now_ns > NS)
     assert stage.now_ns <= NS + 120 * MS
+
+
+def test_emulated_pmus_with_a_spread_differ_in_their_values_alone() -> None:
+    source = recording(stream(rate=60, time_base=0xFFFFFF), 60)
+    for message in source[1:]:
+        assert message.frame.data[10] == 0
+    played = play(source, clock=clock(), cast=lambda reel: emulated(reel, 3, 2, spread=Spread(mag=5, deg=20, mhz=40)))
+    recorded = [message.frame.data for message in source[1:]]
+    deviations = set()
+    for part in range(3):
+        frames = [item.frame for item in played.data if item.stream == part]
+        assert [frame[10:14] for frame in frames] == [frame[10:14] for frame in recorded], "time quality and FRACSEC"
+        assert {chk(frame) for frame in frames} == {0}
+        assert {frame[14:16] for frame in frames} == {b"\0\0"}
+        moved = {int.from_bytes(frame[20:22], "big", signed=True) - k for k, frame in enumerate(frames)}
+        assert len(moved) == 1, "one offset for all of a PMU's frequencies"
+        deviations |= moved
+        sizes = [abs(complex(*(int.from_bytes(f[at : at + 2], "big", signed=True) for at in (16, 18)))) for f in frames]
+        assert max(sizes) - min(sizes) <= 2
+        assert abs(sizes[0] - 1000 * 2**0.5) > 2
+    assert len(deviations) == 3

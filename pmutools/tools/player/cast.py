@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pmutools import draws, parsers
-from pmutools.c37118.batch import decode_batch, encode_batch, wire_view
+from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import NAME_SIZE
 from pmutools.errors import SettingsError
@@ -26,6 +26,8 @@ from pmutools.tools.player.reel import I64, Reel, Track, lengthened
 
 AHEAD_NS = 20_000_000
 """Frames are looked up this far ahead at once."""
+STAMP = slice(6, 14)
+"""Where SOC, time quality and FRACSEC are in a frame."""
 IDCODES = 65_534
 """IDCODE 0 means none, 65535 is reserved."""
 
@@ -193,10 +195,9 @@ class Cast:
             frequency=batch.frequency + offset_hz[:, None],
             wire=None,
         )
-        fresh: npt.NDArray[Any] = encode_batch(batch)[0].copy()
-        old: npt.NDArray[Any] = wire_view(wire, config)
-        fresh["soc"], fresh["fracsec"] = old["soc"], old["fracsec"]  # the latter with the time quality
-        return bytes(fresh.tobytes())
+        fresh = encode_batch(batch)[0]
+        fresh[:, STAMP] = np.frombuffer(wire, np.uint8).reshape(fresh.shape)[:, STAMP]  # with the time quality
+        return fresh.tobytes()
 
 
 def as_recorded(reel: Reel) -> Cast:
