@@ -31,7 +31,7 @@ MAX_CLIENTS = 1024
 """Clients of one listening endpoint: of TCP more are turned away, of UDP the one heard longest ago makes room."""
 GARBAGE_BYTES = 64 << 10
 """Bytes in a row that are no frame, before a TCP client is sent away."""
-COMMANDS = 64
+COMMANDS = 16
 """Commands of one client, or of one UDP port, that a turn of the loop obeys."""
 _COMMAND_BYTES = 18
 _FRAME_BYTES = 0xFFFF
