@@ -83,7 +83,7 @@ def source(*idcodes: int, frames: int = 100) -> list[Message]:
     """Streams of several rates, with recorded latencies."""
     return interleaved(
         *(
-            recording(stream(n, rate=(50, 25, 60)[n % 3]), frames, latency_ns=lambda k, n=n: (n + k * 7 % 13) * MS)  # type: ignore[misc]
+            recording(stream(n, rate=(50, 40, 60)[n % 3]), frames, latency_ns=lambda k, n=n: (n + k * 7 % 13) * MS)  # type: ignore[misc]
             for n in idcodes
         )
     )
@@ -150,8 +150,6 @@ def test_a_run_repeats_another_day_late_and_portably(cast: Callable[[Reel], Cast
     if linux.NATIVE:
         assert all((row["tx_stamp_ns"] is None) is (row["sent_ns"] is None) for row in first)
     assert {row["tx_stamp_ns"] for row in third} == {None}, "the portable path has no stamps"
-    other = ledger_of(path, messages, EVERYTHING, cast=cast, loops=2, seed=12)
-    assert repeatable(first) != repeatable(other)
 
 
 MEMORYLESS = """
