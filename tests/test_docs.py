@@ -3,10 +3,13 @@
 In ``README.md`` and ``docs/``:
 
 - every ```` ```python ```` block runs, in a folder that has ``captures``; a ```` ```text ```` block right after it is
-  exactly what it prints;
+  what it prints;
 - every ``$ `` line of a ```` ```console ```` block is a command that click accepts;
-- under ``<!-- run -->`` (``<!-- run: slow -->``) they are run, one after the other, and print what the block says,
-  where ``...`` stands for anything.
+- under ``<!-- run -->`` (``<!-- run: slow -->``) they are run, one after the other, and print what the block says.
+  A command that ends with ``&`` runs beside those after it, which wait until its
+  ports and sockets are there; it is interrupted at the end of the block. :data:`PORTS` are replaced by free ones.
+
+``...`` stands for anything that is printed.
 """
 
 from __future__ import annotations
@@ -15,9 +18,13 @@ import ast
 import os
 import re
 import shlex
+import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,8 +43,10 @@ WITH_COMMANDS = PAGES | {"captures/README.md": ROOT / "captures" / "README.md"}
 EXPLAINED = ("pmutools/c37118", "pmutools/formats", "pmutools/net", "dcon/core")
 IMAGE_LIMIT_BYTES = 200_000
 TIME_LIMIT_S = 60
-INCOMPLETE = 3
-"""Exit code of a command that found damage, which an example may want to show."""
+INCOMPLETE, INTERRUPTED = 3, 130
+"""Exit codes of a command that found damage, which an example may want to show, and of one that was ended."""
+PORTS = ("4712", "4713", "4790")
+"""Examples use these; whoever runs the tests may use them too."""
 
 sys.path.insert(0, str(DOCS))
 from generate import GENERATORS, display  # noqa: E402
@@ -119,6 +128,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "captures").symlink_to(ROOT / "captures", target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"])))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("COLUMNS", "200")
     return tmp_path
 
@@ -131,7 +141,8 @@ def test_python_examples_run(page: str, number: int, folder: Path, capsys: pytes
     fence = fences(page)[number]
     exec(compile(fence.text, f"{page}, block {number}", "exec"), {"__name__": "example"})
     if fence.after is not None:
-        assert capsys.readouterr().out == fence.after
+        output = capsys.readouterr().out
+        assert said(fence.after.strip(), output), output
 
 
 def steps(text: str) -> Iterator[tuple[str, str]]:
@@ -147,18 +158,72 @@ def said(printed: str, output: str) -> bool:
     return re.fullmatch(pattern, output.strip(), re.DOTALL) is not None
 
 
+def free_ports() -> dict[str, str]:
+    """A port that nobody has for each of :data:`PORTS`."""
+    with ExitStack() as stack:
+        taken = [stack.enter_context(socket.socket()) for _ in PORTS]
+        for sock in taken:
+            sock.bind(("127.0.0.1", 0))
+        return {port: str(sock.getsockname()[1]) for port, sock in zip(PORTS, taken, strict=True)}
+
+
+def replaced(text: str, words: dict[str, str]) -> str:
+    return re.sub("|".join(rf"\b{word}\b" for word in words), lambda match: words[match[0]], text)
+
+
+def opened(place: str) -> bool:
+    """Whether a port, or a unix socket by its path, is there."""
+    if not place.isdigit():
+        return Path(place).exists()
+    with socket.socket() as stream, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
+        stream.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            for sock in (stream, datagrams):
+                sock.bind(("127.0.0.1", int(place)))
+        except OSError:
+            return True
+    return False
+
+
+@contextmanager
+def beside(command: str) -> Iterator[None]:
+    """``command`` runs meanwhile, and is interrupted at the end."""
+    listens = re.findall(r"(?:read|--listen|--control) \S*?(\d{4,5}|\./\S+)\b", command)
+    process = subprocess.Popen(
+        f"exec {command}", shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        deadline = time.monotonic() + TIME_LIMIT_S
+        while process.poll() is None and not all(map(opened, listens)) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=TIME_LIMIT_S)
+    assert process.returncode in (0, INCOMPLETE, INTERRUPTED), (command, output)
+
+
 def run_examples(page: str, marker: str) -> None:
     for fence in fences(page):
-        if fence.marker != marker:
+        if fence.marker == marker:
+            with ExitStack() as stack:
+                run_block(page, fence, stack)
+
+
+def run_block(page: str, fence: Fence, stack: ExitStack) -> None:
+    ports = free_ports()
+    back = {free: port for port, free in ports.items()}
+    for shown, printed in steps(fence.text):
+        command = replaced(shown, ports)
+        if command.endswith(" &"):
+            stack.enter_context(beside(command.removesuffix(" &")))
             continue
-        for command, printed in steps(fence.text):
-            done = subprocess.run(
-                command, shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=TIME_LIMIT_S
-            )
-            assert done.returncode in (0, INCOMPLETE), (command, done.stdout)
-            assert said(printed, done.stdout), (
-                f"{page}: $ {command}\n--- prints\n{done.stdout}--- is said to print\n{printed}"
-            )
+        done = subprocess.run(
+            command, shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=TIME_LIMIT_S
+        )
+        output = replaced(done.stdout, back)
+        assert done.returncode in (0, INCOMPLETE), (shown, output)
+        assert said(printed, output), f"{page}: $ {shown}\n--- prints\n{output}--- is said to print\n{printed}"
 
 
 RUN = [page for page in PAGES if any(fence.marker == "run" for fence in fences(page))]
