@@ -149,6 +149,9 @@ def steps(text: str) -> Iterator[tuple[str, str]]:
     """(command, what it is said to print) of a console block."""
     for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
         command, _, printed = part.partition("\n")
+        while command.endswith("\\"):
+            more, _, printed = printed.partition("\n")
+            command = f"{command[:-1].rstrip()} {more.strip()}"
         yield command, printed.strip()
 
 
