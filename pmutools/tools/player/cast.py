@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pmutools import draws, parsers
 from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.constants import NAME_SIZE
+from pmutools.c37118.constants import NAME_SIZE, PREFIX_SIZE
 from pmutools.errors import SettingsError
 from pmutools.parsers import bind, call, parsed_by
 from pmutools.timebase import NS
@@ -195,8 +195,9 @@ class Cast:
             frequency=batch.frequency + offset_hz[:, None],
             wire=None,
         )
-        fresh = encode_batch(batch)[0]
-        fresh[:, STAMP] = np.frombuffer(wire, np.uint8).reshape(fresh.shape)[:, STAMP]  # with the time quality
+        fresh, _ = encode_batch(batch)
+        old = np.frombuffer(wire, np.uint8).reshape(fresh.shape)
+        fresh[:, :PREFIX_SIZE] = old[:, :PREFIX_SIZE]
         return fresh.tobytes()
 
 
@@ -222,7 +223,7 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         idcode = (first - 1 + number) % IDCODES + 1
         phase_ns = int(_period_ns(reel, track) * number / count) if stagger else 0
         part = Part(place, name, idcode, phase_ns, emulated=True)
-        parts.append(_spread(part, spread, seed) if spread else part)
+        parts.append(_spread(part, number, spread, seed) if spread else part)
     return Cast(lengthened(reel, max(part.phase_ns for part in parts)), parts)
 
 
@@ -240,8 +241,9 @@ def clone_name(track: Track, number: int, count: int) -> str:
     return track.name.encode()[: NAME_SIZE - len(digits)].decode(errors="ignore").rstrip() + digits
 
 
-def _spread(part: Part, spread: Spread, seed: int) -> Part:
-    mag, deg, mhz = (draws.normal(seed, part.name, f"spread.{what}", 0) for what in ("mag", "deg", "mhz"))
+def _spread(part: Part, number: int, spread: Spread, seed: int) -> Part:
+    """With the values that its number draws, however many there are."""
+    mag, deg, mhz = (draws.normal(seed, "emulated", f"spread.{what}", number) for what in ("mag", "deg", "mhz"))
     return replace(
         part,
         gain=max(0.0, 1 + mag * spread.mag / 100),
