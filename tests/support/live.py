@@ -40,11 +40,12 @@ def stream(idcode: int = 7, *, phasors: int = 1, rate: int = 60, cfgcnt: int = 0
 
 
 def data_frame(config: StreamConfig, time_ns: int, *, stat: int = 0, value: int = 0) -> bytes:
-    """One data frame of a :func:`stream`; ``value`` is its frequency deviation in mHz."""
+    """One data frame of a :func:`stream`, or of one with analogs; ``value`` is its frequency deviation in mHz."""
     soc, fracsec = from_ns(time_ns, config.time_base)
     prefix = Prefix(FrameType.DATA.sync, config.frame_size, config.idcode, soc, 0, fracsec)
-    phasors = [1000, -1000] * len(config.stations[0].phasors)
-    return encode_data(wire_values(config, prefix, [[stat, *phasors, value, 0]]))
+    station = config.stations[0]
+    values = [stat, *[1000, -1000] * len(station.phasors), value, 0, *[5] * len(station.analogs)]
+    return encode_data(wire_values(config, prefix, [values]))
 
 
 def values(messages: list[Message]) -> list[int]:

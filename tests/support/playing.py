@@ -294,16 +294,17 @@ def play(
     stop: Callable[[], bool] = lambda: False,
     orders: Mapping[int, str | Callable[[Player], object]] | None = None,
     skip_gaps_ns: int | None = None,
+    reel: Reel | None = None,
     **options: Any,
 ) -> Played:
     """Play ``messages`` to the end; ``options`` are those of :class:`Options`, ``policy`` and ``speed`` as text.
 
     ``orders`` are given to the player at these times, ns from the beginning; those of one time on lines of their own;
-    or something is done with it.
+    or something is done with it. ``reel`` instead of ``messages`` is what there is already.
     """
     clock = clock or VirtualClock()
     stage = stage or Stage(clock)
-    reel = reel_of(messages, timing, window, select, exclude)
+    reel = reel or reel_of(messages, timing, window, select, exclude)
     if skip_gaps_ns is not None:
         reel, _ = without_gaps(reel, skip_gaps_ns)
     if interval_ns is not None:

@@ -140,7 +140,7 @@ class Plan:
     def until(self, offset_ns: int) -> Sheet:
         """The copies that are to leave before ``offset_ns`` and were not given before, in the order in which they do.
 
-        Copies that will not be sent are among them. Equal offsets leave in the order of the source.
+        Copies that will not be sent are among them. A stream's copies of one offset leave in the order of the source.
         """
         fresh: list[Sheet] = []
         while self._playback.running and not self.ended:
