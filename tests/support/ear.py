@@ -43,7 +43,7 @@ class Ear(NamedTuple):
     again: bool = False
     """Connect, and ask, anew whenever the connection ends."""
     data_port: int = 0
-    """Of ``tcp+udp``."""
+    """Of ``tcp+udp``; 0: another ear hears the data."""
 
 
 class Chunk(NamedTuple):
@@ -136,8 +136,10 @@ class _Listener:
         self.events: list[tuple[int, str]] = []
         self._later = list(ear.later)
         self.lost = False
-        if ear.scheme in ("udp", "tcp+udp"):
-            self._hear(_bound(ear.host if ear.scheme == "udp" else "127.0.0.1", ear.data_port or ear.port))
+        if ear.scheme == "udp":
+            self._hear(_bound(ear.host, ear.port))
+        elif ear.data_port:
+            self._hear(_bound("127.0.0.1", ear.data_port))
         if ear.scheme != "udp":
             self.connect()
 

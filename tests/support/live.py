@@ -65,13 +65,21 @@ def free_udp_port(host: str = "127.0.0.1") -> int:
         return int(probe.getsockname()[1])
 
 
-def free_udp_ports(count: int) -> list[int]:
-    """So many different ones, of loopback."""
+def free_ports(count: int) -> list[int]:
+    """So many different ports of loopback that neither UDP nor TCP had in use a moment ago."""
+    found: list[int] = []
     with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for probe in probes:
+        while len(found) < count:
+            probe, other = (
+                stack.enter_context(socket.socket(socket.AF_INET, kind))
+                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM)
+            )
             probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
+            port = int(probe.getsockname()[1])
+            with contextlib.suppress(OSError):
+                other.bind(("127.0.0.1", port))
+                found.append(port)
+    return found
 
 
 @dataclass

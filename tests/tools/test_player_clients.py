@@ -16,7 +16,7 @@ from support.chain import EarlyClock, playing
 from support.commands import started, wait_for_tcp
 from support.ear import CFG1, CFG2, CFG3, HEADER, START, STOP, Ear, Heard, good, is_data, listening, undisturbed, word
 from support.ear import command as command_of
-from support.live import free_udp_ports
+from support.live import free_ports
 from support.nuisance import DATAGRAMS, KINDS, nuisance
 from support.peers import free_port
 from support.playing import MS, interleaved, number, recording, reel_of, stream
@@ -181,7 +181,7 @@ def test_every_command_to_two_streams_from_clients_of_their_own(scheme: str) -> 
     """Each client has a stream of its own; with ``tcp`` and ``udp+cmd`` a third has started both."""
     reel = reel_of(interleaved(recording(stream(7), 5000), recording(stream(8), 5000)))
     clock, over = EarlyClock(reel.first_due_ns), threading.Event()
-    data_ports = free_udp_ports(2)
+    data_ports = free_ports(2)
     urls = [f"{scheme}://127.0.0.1:0"]
     if scheme == "tcp+udp":
         urls = [f"{scheme}://127.0.0.1:0?data={port}&idcode={n}" for n, port in zip((7, 8), data_ports, strict=True)]

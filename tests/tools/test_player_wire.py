@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import pytest
 from support.chain import EarlyClock, playing
 from support.ear import CFG2, Chunk, Ear, Heard, good, listening, sealed, undisturbed, word
-from support.live import free_udp_ports
+from support.live import free_ports
 from support.playing import MS, interleaved, recording, reel_of, stream
 
 from pmutools.impair.profile import parse_profile
@@ -656,7 +656,7 @@ def run(transport: str, ledger: Path, *, native: bool = True) -> Played:
             later=fault.asks,
             again=fault.again,
         )
-        for number, (port, (what, fault)) in enumerate(zip(free_udp_ports(len(FAULTS)), FAULTS.items(), strict=True))
+        for number, (port, (what, fault)) in enumerate(zip(free_ports(len(FAULTS)), FAULTS.items(), strict=True))
     }
     unasked = [ear for ear in ears.values() if ear.scheme == "udp"]
     asked = [ear for ear in ears.values() if ear.scheme != "udp"]
