@@ -73,18 +73,19 @@ def fifo(priority: int = 10) -> str | None:
 
 
 def lock_memory() -> str | None:
-    """Keep this process's memory from being paged out. None, or why not.
+    """Keep memory that this process has used from being paged out. None, or why not.
 
-    Future mappings are locked too only where no RLIMIT_MEMLOCK holds: under a limit they would start to fail.
+    What is only reserved (Arrow reserves a GB) is not filled for it: that would take seconds. Future mappings are
+    locked too only where no RLIMIT_MEMLOCK holds: under a limit they would start to fail.
     """
     if libc is None:
         return "memory lock: only Linux has it"
     import resource
 
-    mcl_current, mcl_future = 1, 2
+    mcl_current, mcl_future, mcl_onfault = 1, 2, 4
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     free = limit == resource.RLIM_INFINITY or _may_lock_memory()
-    if libc.mlockall(mcl_current | mcl_future if free else mcl_current):
+    if libc.mlockall(mcl_onfault | mcl_current | (mcl_future if free else 0)):
         return f"memory lock: {os.strerror(ctypes.get_errno())}; raise RLIMIT_MEMLOCK ({limit} bytes) for it"
     return None
 

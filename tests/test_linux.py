@@ -52,6 +52,23 @@ def test_timer_slack_fifo_and_lock_either_work_or_say_why() -> None:
         assert reason == "None" or "for it" in reason
 
 
+@native
+@pytest.mark.realtime
+def test_memory_that_is_only_reserved_is_not_filled_by_the_lock() -> None:
+    out = run_python(
+        "import mmap; reserved = mmap.mmap(-1, 1 << 30)\n"
+        "from pmutools import linux\n"
+        "told = linux.lock_memory()\n"
+        "sizes = dict(line.split()[:2] for line in open('/proc/self/status') if line.startswith('Vm'))\n"
+        "print(told, sizes['VmRSS:'], sizes['VmLck:'], sep='|')"
+    )
+    told, resident, locked = out.split("|")
+    if told != "None":
+        pytest.skip(told)
+    assert int(locked) > 1 << 20, "a GB and more, in kB"
+    assert int(resident) < 1 << 19
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux's schedulers")
 @pytest.mark.realtime
 @pytest.mark.parametrize("portable", ["0", "1"])
