@@ -33,8 +33,9 @@ from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.pacing import Playback
 from pmutools.timebase import NS, slot, slot_time_ns
-from pmutools.tools.player.cast import Spread, as_recorded, emulated
+from pmutools.tools.player.cast import Cast, as_recorded, emulated
 from pmutools.tools.player.plan import Plan
+from pmutools.tools.player.reel import Reel
 from pmutools.tools.player.stamps import StampPolicy
 from pmutools.tools.window import Window, parse_moment
 
@@ -422,3 +423,33 @@ def test_emulated_pmus_with_a_spread_differ_in_their_values_alone() -> None:
         assert max(sizes) - min(sizes) <= 2
         assert abs(sizes[0] - 1000 * 2**0.5) > 2
     assert len(deviations) == 3
+
+
+def test_a_loop_of_a_recording_with_latencies_leaves_no_gap() -> None:
+    source = recording(stream(), 100, latency_ns=lambda k: (30 + k * 7 % 9) * MS)
+    played = play(source, clock=clock(), loops=3)
+    assert played.numbers() == [*range(100)] * 3
+    assert spaced(played.stamps(), 20 * MS)
+    late = [left - stamp for left, stamp in zip(utc(played), played.stamps(), strict=True)]
+    assert late == [(30 + k * 7 % 9) * MS for k in range(100)] * 3
+
+
+def test_frames_late_at_the_end_of_a_round_leave_amid_the_next() -> None:
+    source = recording(stream(), 100, latency_ns=lambda k: 150 * MS if k >= 98 else 5 * MS)
+    played = play(source, clock=clock(), loops=3)
+    assert sorted(played.stamps()) == [played.stamps()[0] + k * 20 * MS for k in range(300)]
+    late = {left - stamp for left, stamp in zip(utc(played), played.stamps(), strict=True)}
+    assert late == {5 * MS, 150 * MS}
+    assert played.numbers()[98:110] == [0, 1, 2, 3, 4, 5, 98, 6, 99, 7, 8, 9]
+    assert played.numbers()[-2:] == [98, 99]
+
+
+def test_emulated_phases_go_on_over_loops() -> None:
+    def cast(reel: Reel) -> Cast:
+        return emulated(reel, 7, seed=1)
+
+    played = play(recording(stream(), 50), clock=clock(), loops=3, cast=cast)
+    for part in range(7):
+        assert spaced(played.times(part), 20 * MS)
+        assert spaced(played.stamps(part), 20 * MS)
+    assert len(played.data) == 7 * 150

@@ -22,11 +22,10 @@ from pmutools.c37118.constants import NAME_SIZE, PREFIX_SIZE
 from pmutools.errors import SettingsError
 from pmutools.parsers import bind, call, parsed_by
 from pmutools.timebase import NS
-from pmutools.tools.player.reel import I64, Reel, Track, lengthened
+from pmutools.tools.player.reel import I64, Reel, Track
 
 AHEAD_NS = 20_000_000
 """Frames are looked up this far ahead at once."""
-STAMP = slice(6, 14)
 """Where SOC, time quality and FRACSEC are in a frame."""
 IDCODES = 65_534
 """IDCODE 0 means none, 65535 is reserved."""
@@ -224,7 +223,7 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         phase_ns = int(_period_ns(reel, track) * number / count) if stagger else 0
         part = Part(place, name, idcode, phase_ns, emulated=True)
         parts.append(_spread(part, number, spread, seed) if spread else part)
-    return Cast(lengthened(reel, max(part.phase_ns for part in parts)), parts)
+    return Cast(reel, parts)
 
 
 def _period_ns(reel: Reel, track: Track) -> Fraction:

@@ -92,6 +92,9 @@ class Plan:
         self._planned_ns = 0
         self._cursor_ns = 0
         self._loop = 0
+        self._span_ns = cast.reel.length_ns + cast.latest_ns + 1
+        self._spills = False
+        """Whether late frames of the round before may still come."""
         self._stop_ns: int | None = None
         self._resumes_ns = 0
         """When a pause for some time ends by itself."""
@@ -128,11 +131,8 @@ class Plan:
         """When something is to leave, or to be done, next; None while nothing is."""
         times = [sheet.offset_ns[0] for sheet in self._waiting.get(min(self._waiting, default=0), ())]
         if self._playback.running and not self.ended:
-            position = self.cast.next_position(self.position_ns)
-            until_ns = self._until_ns()
-            base_ns = self._round_start(self._loop)
-            stream_ns = until_ns if position is None else min(base_ns + position, until_ns)
-            times.append(self._playback.target_ns(stream_ns))
+            row_ns, until_ns = self._next_row_ns(), self._until_ns()
+            times.append(self._playback.target_ns(until_ns if row_ns is None else min(row_ns, until_ns)))
         return int(min(times)) if times else None
 
     # --- going on
@@ -180,7 +180,8 @@ class Plan:
                 self._stop_ns += self._cursor_ns - before_ns
         elif self._cursor_ns >= self._round_end() and not self._last_round:
             self._loop += 1
-        elif self._last_round and self.cast.next_position(self.position_ns) is None:
+            self._spills = self._span_ns > self._reel.round_ns
+        elif self._last_round and self._next_row_ns() is None:
             self._end()
         else:
             return False
@@ -212,7 +213,23 @@ class Plan:
         return loop * self._reel.round_ns.numerator // self._reel.round_ns.denominator
 
     def _round_end(self) -> int:
-        return self._round_start(self._loop + 1)
+        start_ns, end_ns = self._round_start(self._loop), self._round_start(self._loop + 1)
+        return max(end_ns, start_ns + self._span_ns) if self._last_round else end_ns
+
+    def _rounds(self) -> list[int]:
+        """The rounds that rows at the cursor may belong to: the present one, and one whose last frames are late."""
+        if self._spills and self._cursor_ns - self._round_start(self._loop - 1) >= self._span_ns:
+            self._spills = False
+        return [self._loop - 1, self._loop] if self._spills else [self._loop]
+
+    def _next_row_ns(self) -> int | None:
+        """Stream time of the first row from the cursor on; None where there is none."""
+        times = []
+        for loop in self._rounds():
+            base_ns = self._round_start(loop)
+            if (position := self.cast.next_position(self._cursor_ns - base_ns)) is not None:
+                times.append(base_ns + position)
+        return min(times, default=None)
 
     def _here_ns(self) -> int:
         """The offset of the cursor."""
@@ -220,28 +237,32 @@ class Plan:
 
     def _play(self, to_ns: int) -> Sheet:
         """What becomes of the rows from the cursor to ``to_ns``."""
-        base_ns, reel = self._round_start(self._loop), self._reel
-        rows, parts, position = self.cast.between(self._cursor_ns - base_ns, to_ns - base_ns)
+        sheets = [self._play_round(loop, to_ns) for loop in self._rounds()]
         self._cursor_ns = to_ns
+        return joined(sheets)
+
+    def _play_round(self, loop: int, to_ns: int) -> Sheet:
+        base_ns, reel = self._round_start(loop), self._reel
+        rows, parts, position = self.cast.between(self._cursor_ns - base_ns, to_ns - base_ns)
         if not len(rows):
             return EMPTY
         stream_ns = position + base_ns
         offsets = self._playback.targets_ns(stream_ns)
-        stamps = self._stamps(rows, parts, offsets)
+        stamps = self._stamps(rows, loop, offsets)
         whole = self.policy is StampPolicy.SHIFT and reel.fps is None
         dressed = dress(
             self.cast, rows, parts, None if self.policy is StampPolicy.KEEP else stamps, whole_seconds=whole
         )
-        index = reel.rows.number[rows] + self._loop * self._totals[reel.rows.track[rows]]
+        index = reel.rows.number[rows] + loop * self._totals[reel.rows.track[rows]]
         return self._route.through(rows, parts, index, offsets, stream_ns, stamps, dressed)
 
-    def _stamps(self, rows: I64, parts: npt.NDArray[np.int32], offsets: I64) -> I64:
-        """What the rows' frames are to carry, POSIX UTC ns."""
+    def _stamps(self, rows: I64, loop: int, offsets: I64) -> I64:
+        """What the rows' frames are to carry in a round, POSIX UTC ns."""
         stamps = self._reel.rows.stamp_ns[rows]
         if self.policy is StampPolicy.KEEP:
             return self._reel.rows.source_ns[rows]
         if self.policy is StampPolicy.SHIFT:
-            return shifted(stamps, self._reel, self._loop, self._shift_ns)
+            return shifted(stamps, self._reel, loop, self._shift_ns)
         times = self.start_utc_ns + offsets
         if self.policy is StampPolicy.NOW:
             return times
@@ -324,8 +345,8 @@ class Plan:
         if not self._playback.running or self.ended:
             return
         stops = [self._playback.media_from(offset_ns), self._until_ns()]
-        if (position := self.cast.next_position(self.position_ns)) is not None:
-            stops.append(self._round_start(self._loop) + position)
+        if (row_ns := self._next_row_ns()) is not None:
+            stops.append(row_ns)
         self._cursor_ns = max(self._cursor_ns, min(stops))
 
     def _loop_between(self, offset_ns: int, first_ns: int, last_ns: int) -> None:
@@ -399,7 +420,7 @@ class Plan:
 
     def _go(self, offset_ns: int, stream_ns: int) -> None:
         """Go on at ``stream_ns``, from ``offset_ns`` or as soon after it as the stamps allow."""
-        self._cursor_ns, self._resumes_ns = stream_ns, 0
+        self._cursor_ns, self._resumes_ns, self._spills = stream_ns, 0, False
         at_ns = self._aligned(self.start_utc_ns + offset_ns) - self.start_utc_ns
         self._playback = Playback(at_ns, stream_ns, self.speed)
 

@@ -207,7 +207,7 @@ class _Recorder:
         rows = _sorted(rows[rows.track >= 0])
         tracks = tuple(self._tracks[place] for place in chosen)
         editions = tuple(config for _, config in self._editions)
-        seconds = _whole_seconds(int(rows.due_ns[-1] - rows.due_ns[0]) + _period_ns(tracks))
+        seconds = _round_ns(tracks, rows)
         return Reel(tracks, editions, rows, self._wire(), Fraction(seconds), seconds)
 
     def _wire(self) -> npt.NDArray[np.uint8]:
@@ -237,8 +237,15 @@ def _period_ns(tracks: Sequence[Track]) -> int:
     return max((round(NS / track.config.rate) for track in tracks if track.config.rate), default=NS)
 
 
-def _whole_seconds(span_ns: int) -> int:
-    return -(-span_ns // NS) * NS
+def _round_ns(tracks: Sequence[Track], rows: Rows) -> int:
+    """Whole seconds from one loop to the next: no stamp comes twice, and at most the last ones are overtaken.
+
+    Recorded stamps are rounded, so one that is a tenth of a reporting interval late does not cost a second.
+    """
+    period_ns = _period_ns(tracks)
+    stamps_ns = max(track.last_ns for track in tracks) - min(track.first_ns for track in tracks)
+    due_ns = int(rows.due_ns[-1] - rows.due_ns[0])
+    return -(-max(stamps_ns + period_ns - period_ns // 10, due_ns - LATENCY_MAX_NS // 2, 1) // NS) * NS
 
 
 def _name(tracks: Sequence[Track]) -> None:
@@ -278,7 +285,7 @@ def without_gaps(reel: Reel, longest_ns: int) -> tuple[Reel, int]:
     moved = np.concatenate(([0], np.cumsum(cut)))
     rows = replace(rows, due_ns=rows.due_ns - moved, stamp_ns=rows.stamp_ns - moved)
     tracks = tuple(_retimed(track, rows[rows.track == place]) for place, track in enumerate(reel.tracks))
-    seconds = _whole_seconds(int(rows.due_ns[-1] - rows.due_ns[0]) + _period_ns(reel.tracks))
+    seconds = _round_ns(tracks, rows)
     cuts = int(np.count_nonzero(cut))
     return replace(reel, tracks=tracks, rows=rows, round_ns=Fraction(seconds), round_stamp_ns=seconds), cuts
 
@@ -314,18 +321,7 @@ def at_rate(reel: Reel, fps: int) -> Reel:
     rows = _sorted(replace(reel.rows, due_ns=due, stamp_ns=stamps))
     intervals = max(int(later[k]) + track.frames for k, track in enumerate(reel.tracks))
     round_ns = Fraction(intervals * NS, fps)
-    return lengthened(replace(reel, rows=rows, round_ns=round_ns, fps=fps, round_slots=intervals), 0)
-
-
-def lengthened(reel: Reel, later_ns: int) -> Reel:
-    """With rounds that are not over before a frame ``later_ns`` after the last row: one with a great latency, say."""
-    last_ns = reel.length_ns + later_ns
-    if last_ns < reel.round_ns:
-        return reel
-    if reel.fps is None:
-        return replace(reel, round_ns=Fraction(last_ns + 1))
-    slots = last_ns * reel.fps // NS + 1
-    return replace(reel, round_ns=Fraction(slots * NS, reel.fps), round_slots=slots)
+    return replace(reel, rows=rows, round_ns=round_ns, fps=fps, round_slots=intervals)
 
 
 def slot_times(slots: I64, fps: int) -> I64:
