@@ -33,7 +33,7 @@ from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.pacing import Playback
 from pmutools.timebase import NS, slot, slot_time_ns
-from pmutools.tools.player.cast import Cast, as_recorded, emulated
+from pmutools.tools.player.cast import Cast, Spread, as_recorded, emulated
 from pmutools.tools.player.plan import Plan
 from pmutools.tools.player.reel import Reel
 from pmutools.tools.player.stamps import StampPolicy

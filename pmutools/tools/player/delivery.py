@@ -13,9 +13,9 @@ from pmutools.net.cargo import Frames
 from pmutools.net.server import Senders
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.ledger import LedgerWriter
-from pmutools.tools.player.plan import Gate
 from pmutools.tools.player.reel import I64
 from pmutools.tools.player.results import Results
+from pmutools.tools.player.route import Gate
 from pmutools.tools.player.sheet import FAILED, SENT, SKIPPED, Sheet
 
 TOGETHER_FRAMES = 1024

@@ -12,45 +12,25 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pmutools import timebase
 from pmutools.errors import SettingsError
-from pmutools.flow import Hangup
-from pmutools.impair.outgoing import Fate, Outgoing
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Action
 from pmutools.impair.verbs import Place
 from pmutools.pacing import Playback
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
-from pmutools.tools.player.dress import Dressed, dress
+from pmutools.tools.player.dress import dress
 from pmutools.tools.player.reel import I64, Reel
-from pmutools.tools.player.sheet import EMPTY, FATES, Extra, Sheet, clean, joined
+from pmutools.tools.player.route import Gate, Route
+from pmutools.tools.player.sheet import EMPTY, Sheet, joined
 from pmutools.tools.player.stamps import StampPolicy, on_grid, shifted
 
-_FATE_CODES = {fate: code for code, fate in enumerate(FATES)}
 _BUCKET_NS = 10_000_000
 """What waits for its time is sorted into buckets of this length."""
-
-
-class Gate(NamedTuple):
-    """At ``offset_ns`` TCP clients of ``part`` are hung up on; None: they may come back."""
-
-    offset_ns: int
-    part: int
-    hangup: Hangup | None
-
-
-class _Origin(NamedTuple):
-    """What a ledger wants to know of a frame that a pipeline may hold back."""
-
-    source_ns: int
-    stamp_ns: int
-    edition: int
 
 
 class Plan:
@@ -85,7 +65,7 @@ class Plan:
         self.cast, self.policy, self.loops = cast, policy, loops
         self._reel = cast.reel
         self._playback = Playback(0, 0, speed)
-        self._route = _Route(cast, pipelines, marks=marks)
+        self._route = Route(cast, pipelines, marks=marks)
         self._timeline = deque(timeline)
         self._totals = np.array([track.total for track in self._reel.tracks], np.int64)
         self._period_ns = _period_ns(cast.reel)
@@ -471,175 +451,3 @@ def _period_ns(reel: Reel) -> Fraction:
     editions = [reel.editions[edition] for edition in np.unique(reel.rows.edition)]
     rates = [Fraction(reel.fps)] if reel.fps is not None else [config.rate for config in editions]
     return NS / (max(rates) or Fraction(1))
-
-
-# --- through the pipelines ------------------------------------------------------------------------------------------
-
-_CLEAR, _DELAYED, _BUSY = range(3)
-
-
-class _Route:
-    """Every stream's way through its pipeline; what is held back there keeps its origin here."""
-
-    def __init__(self, cast: Cast, pipelines: Sequence[Pipeline], *, marks: bool) -> None:
-        self._cast, self._pipelines, self._marks = cast, pipelines, marks
-        self._origins: list[dict[int, _Origin]] = [{} for _ in pipelines]
-        self._edition = cast.editions.copy()
-        self.gates: list[Gate] = []
-        self.warnings: list[str] = []
-        self._hung: dict[int, Hangup | None] = {}
-        self._mode = np.array([_mode(pipeline) for pipeline in pipelines], np.int8)
-
-    def act(self, action: Action) -> list[int]:
-        for part in np.flatnonzero(self._mode == _CLEAR).tolist():
-            self._pipelines[part].delays_ns(np.zeros(1, np.int64))  # it has not seen the frames that passed it by
-        for pipeline in self._pipelines:  # of several streams, all or none
-            pipeline.check(action)
-        concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
-        for part in concerned:
-            self._set_mode(part)
-        return concerned
-
-    def through(
-        self,
-        rows: I64,
-        parts: npt.NDArray[np.int32],
-        index: I64,
-        offsets: I64,
-        stream_ns: I64,
-        stamps: I64,
-        dressed: Dressed,
-    ) -> Sheet:
-        """What becomes of frames (N,) given in the order in which they are due."""
-        reel = self._cast.reel
-        editions, sources = reel.rows.edition[rows], reel.rows.source_ns[rows]
-        sheet = clean(offsets, parts, index, sources, stamps, editions, dressed.at, dressed.nbytes, dressed.wire)
-        if not self._mode.any() and np.array_equal(self._edition[parts], editions):
-            return sheet
-        pieces, first = [], 0
-        for row in self._changes(parts, editions):
-            pieces.append(self._faulty(sheet.take(slice(first, row)), stream_ns[first:row]))
-            first = row
-            self._configure(int(parts[row]), int(editions[row]))
-        pieces.append(self._faulty(sheet.take(slice(first, None)), stream_ns[first:]))
-        return joined(pieces)
-
-    def _changes(self, parts: npt.NDArray[np.int32], editions: npt.NDArray[np.int32]) -> list[int]:
-        """The rows before which a stream's configuration changes."""
-        now, changes = self._edition.copy(), []
-        for row in np.flatnonzero(now[parts] != editions) if len(np.unique(parts)) == len(parts) else range(len(parts)):
-            if now[parts[row]] != editions[row]:
-                now[parts[row]] = editions[row]
-                changes.append(int(row))
-        return changes
-
-    def _configure(self, part: int, edition: int) -> None:
-        self._edition[part] = edition
-        self.warnings += self._pipelines[part].adapt(self._cast.config(part, edition))
-        self._set_mode(part)
-
-    def _set_mode(self, part: int) -> None:
-        """How frames of ``part`` pass; one by one too until clients that were hung up on may come back."""
-        self._mode[part] = _BUSY if self._hung.get(part) is not None else _mode(self._pipelines[part])
-
-    def _faulty(self, sheet: Sheet, stream_ns: I64) -> Sheet:
-        modes = self._mode[sheet.part]
-        if not modes.any():
-            return sheet
-        delayed = np.flatnonzero(modes == _DELAYED)
-        if len(delayed):
-            sheet = self._delay(sheet, delayed)
-        busy = np.flatnonzero(modes == _BUSY)
-        if not len(busy):
-            return sheet
-        return joined([sheet.take(modes != _BUSY), self._apply(sheet, busy, stream_ns)])
-
-    def _delay(self, sheet: Sheet, rows: npt.NDArray[np.int64]) -> Sheet:
-        """With the delays of frames whose index alone decides them."""
-        offsets, faults = sheet.offset_ns.copy(), sheet.faults.copy()
-        parts = sheet.part[rows]
-        for part in np.unique(parts):
-            own = rows[parts == part]
-            delays = self._pipelines[part].delays_ns(sheet.index[own])
-            assert delays is not None
-            offsets[own] += delays
-            if self._marks:
-                faults[own] = [f"delay:{delay / 1e6:.6g}ms" if delay else "" for delay in delays.tolist()]
-        return replace(sheet, offset_ns=offsets, faults=faults)
-
-    def _apply(self, sheet: Sheet, rows: npt.NDArray[np.int64], stream_ns: I64) -> Sheet:
-        """Frames that go through their pipelines one by one."""
-        out: list[tuple[int, Outgoing, _Origin]] = []
-        for row in rows.tolist():
-            part = int(sheet.part[row])
-            pipeline, origins, index = self._pipelines[part], self._origins[part], int(sheet.index[row])
-            source_ns = int(sheet.source_ns[row])
-            origins[index] = _Origin(source_ns, int(sheet.stamp_ns[row]), int(sheet.edition[row]))
-            done = pipeline.apply(
-                index, sheet.frame(row), int(sheet.offset_ns[row]), int(stream_ns[row]), stamp_ns=source_ns
-            )
-            self._take(part, done, out)
-            hangup = None if pipeline.hangup is Hangup.SILENCE else pipeline.hangup
-            if hangup is not self._hung.get(part):
-                self._hung[part] = hangup
-                self.gates.append(Gate(int(sheet.offset_ns[row]), part, hangup))
-            if pipeline.refused:
-                self.warnings += pipeline.refused
-                pipeline.refused.clear()
-            if not pipeline.holding:
-                origins.clear()
-                self._set_mode(part)
-        return self._sheet(out)
-
-    def _take(self, part: int, done: Sequence[Outgoing], out: list[tuple[int, Outgoing, _Origin]]) -> None:
-        origins = self._origins[part]
-        for copy in done:
-            out.append((part, copy, origins[copy.index]))
-            if copy.fate is Fate.DISABLED:  # it was held at most once, and will not come again
-                del origins[copy.index]
-
-    def end(self) -> Sheet:
-        """What the pipelines still hold back."""
-        out: list[tuple[int, Outgoing, _Origin]] = []
-        for part, pipeline in enumerate(self._pipelines):
-            if self._mode[part] == _BUSY:
-                self._take(part, pipeline.close(), out)
-        return self._sheet(out)
-
-    def _sheet(self, out: Sequence[tuple[int, Outgoing, _Origin]]) -> Sheet:
-        if not out:
-            return EMPTY
-        nbytes = np.array([len(copy.data) for _, copy, _ in out], np.int64)
-        faults, extra = np.empty(len(out), np.object_), np.empty(len(out), np.object_)
-        for row, (_, copy, _) in enumerate(out):
-            faults[row] = copy.faults if self._marks else ""
-            extra[row] = _extra(copy)
-        return Sheet(
-            np.array([copy.offset_ns for _, copy, _ in out], np.int64),
-            np.array([part for part, _, _ in out], np.int32),
-            np.array([copy.index for _, copy, _ in out], np.int64),
-            np.array([copy.copy for _, copy, _ in out], np.int32),
-            np.array([origin.source_ns for *_, origin in out], np.int64),
-            np.array([origin.stamp_ns for *_, origin in out], np.int64),
-            np.array([_FATE_CODES[copy.fate] for _, copy, _ in out], np.uint8),
-            np.array([self._cast.edition_of(part, copy.config, o.edition) for part, copy, o in out], np.int32),
-            faults,
-            extra,
-            np.cumsum(nbytes) - nbytes,
-            nbytes,
-            np.frombuffer(b"".join(copy.data for _, copy, _ in out), np.uint8),
-        )
-
-
-def _extra(copy: Outgoing) -> Extra | None:
-    extra = Extra(copy.write, copy.notice)
-    return None if extra == _ORDINARY else extra
-
-
-_ORDINARY = Extra()
-
-
-def _mode(pipeline: Pipeline) -> int:
-    if pipeline.clear:
-        return _CLEAR
-    return _BUSY if pipeline.delays_ns(np.zeros(0, np.int64)) is None else _DELAYED
