@@ -89,8 +89,8 @@ def _spread(text: str) -> Spread:
 @click.argument("files", nargs=-1, metavar="FILE...")
 @click.option("--to", multiple=True, metavar="URL", help="Send to udp://HOST:PORT; repeatable, ?idcode=N picks one.")
 @click.option("--listen", multiple=True, metavar="URL", help="Serve at tcp://, udp+cmd:// or tcp+udp://; repeatable.")
-@click.option("--plant", metavar="NAME", help="Instead of files: a simulated grid (modal).")
-@click.option("--scenario", default=None, metavar="NAME", help="What happens to the plant; default cjb.")
+@click.option("--plant", metavar="NAME", help="Instead of files: a simulated grid, say modal.")
+@click.option("--scenario", default=None, metavar="NAME", help="What happens to it: cjb (default), ambient, ...")
 @click.option("--pmus", type=click.IntRange(1, 200), metavar="N", help="PMUs of the plant; default 8.")
 @click.option("--select", multiple=True, metavar="NAME|IDCODE", help="Only this stream; repeatable.")
 @click.option("--exclude", multiple=True, metavar="NAME|IDCODE", help="Not this stream; repeatable.")
@@ -181,6 +181,8 @@ def command(
     options, choice = _options(*endpoints, said), _choice(said)
     if ledger is not None:
         spare(ledger, choice.files)
+        if ledger.suffix != ".parquet":
+            raise SettingsError(f"--ledger {ledger}: it is a Parquet table; name it {ledger.with_suffix('.parquet')}")
     stuff = material(choice, lambda source: Watched(source, talk))
     cast = stuff.cast
     for note in stuff.notes:
@@ -241,6 +243,10 @@ def command(
         talk.say(f"  {name}: {count}")
     if stopped:
         return Exit.INTERRUPTED
+    fates = player.results.fates()
+    if fates.get("failed") and not fates.get("sent"):
+        talk.complain("no frame could be sent; is there a route to where they go?")
+        return Exit.FAILED
     return Exit.INCOMPLETE if stuff.losses else Exit.DONE
 
 

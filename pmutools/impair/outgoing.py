@@ -21,7 +21,7 @@ class Fate(StrEnum):
     SKIPPED = "skipped"
     """Due, but passed over by the player (a seek, a late policy, no client)."""
     FAILED = "failed"
-    """The operating system refused it."""
+    """The operating system refused it, or a fault cut its connection."""
 
 
 class Outgoing(NamedTuple):

@@ -92,6 +92,7 @@ class Pipeline:
         self.refused: list[str] = []
         """What the timeline asked for and could not be, in words."""
         self._others = 0
+        self._time_ns = self._offset_ns = 0
         self._held = deque[_Held]()
         self._flushed: tuple[Outgoing, ...] = ()
         self._switch: Switch | None = None
@@ -231,6 +232,7 @@ class Pipeline:
                 self._fresh = self._fresh or frame_type.is_config
             return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns),)
         time_ns = offset_ns if stream_ns is None else stream_ns
+        self._time_ns, self._offset_ns = time_ns, offset_ns
         while self._actions and self._actions[0].at_ns <= time_ns:
             try:
                 self.act(self._actions.popleft())
@@ -250,6 +252,22 @@ class Pipeline:
             data, at, marks = self._spoilt(data, at)
             config = self._reconfiguration.config(self._active)
         return self._gated(Outgoing(index, 0, data, offset_ns, Fate.SENT, 0, marks, config, self._notice), at)
+
+    def told(self, data: bytes) -> tuple[bytes, ...]:
+        """What becomes of a frame that a client is told at once: a configuration or a header, asked for or not.
+
+        Content faults, drop, loss and duplicates that select such frames (``when=type config``) apply, in the stream
+        time of the last data frame; a gate does not shut the command channel, and nothing is delayed.
+        """
+        frame_type = _TYPES[data[1] >> 4 & 7]
+        self._fresh = self._fresh or frame_type.is_config
+        if self._delay_of is not None or frame_type is FrameType.DATA:
+            return (data,)
+        original = Original(data, self._config, None)
+        at = Moment(self._others, self._time_ns, frame_type, CONTROL_LANE, self._offset_ns, False, original)
+        self._others += 1
+        spoilt, _ = self._corrupted(data, at)
+        return (spoilt,) * self._transmission.copies(at)
 
     def close(self) -> tuple[Outgoing, ...]:
         """The end: what is still held back; frames kept for a burst that never came were disabled."""

@@ -99,6 +99,15 @@ class Transmission:
     def _set_segment(self, parts: tuple[Segment, ...]) -> None:
         self._segmenting = Segmenting(parts, self._draws) if parts else None
 
+    def copies(self, at: Moment) -> int:
+        """How many copies of a frame leave, 0 where it is dropped or lost; for frames that wait for nothing."""
+        if any(drops(at) for drops in self._drops) or any(lost(at) and selected(at) for lost, selected in self._losses):
+            return 0
+        if self._copies is None:
+            return 1
+        happens, selected, count = self._copies
+        return 1 + count if happens(at) and selected(at) else 1
+
     def send(self, row: Outgoing, at: Moment) -> tuple[Outgoing, ...]:
         """The rows of a frame that passed the gate, due at ``row.offset_ns``."""
         for drops in self._drops:

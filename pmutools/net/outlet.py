@@ -8,7 +8,7 @@ asks, a turn of the loop obeys :data:`COMMANDS` of its commands at most; the res
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import islice
 from typing import NamedTuple
@@ -85,6 +85,8 @@ class Stage(NamedTuple):
     native: bool = linux.NATIVE
     stamped: bool = False
     """Whether departures are stamped."""
+    treat: Callable[[int, bytes], Sequence[bytes]] = lambda handle, frame: (frame,)
+    """What becomes of a configuration or a header of a stream (by its handle) on its way out."""
 
 
 # --- clients -----------------------------------------------------------------------------------------------------
@@ -184,18 +186,18 @@ class Outlet:
         """What waits for clients to take it; nothing ever does over UDP."""
         return 0
 
-    def _obey(self, client: _Client, frame: bytes) -> bytes | None:
-        """Do what a frame from a client asks for; returns the answer to send."""
+    def _obey(self, client: _Client, frame: bytes) -> Sequence[bytes]:
+        """Do what a frame from a client asks for; returns the answer to send, in frames."""
         if self.refused and (idcode := _to_start(frame)) in self.refused:
             self._tell(ServerKind.REFUSED, client.address, idcode=idcode, code=Command.START_DATA)
-            return None
+            return ()
         answer = client.role.hear(frame, self.stage.reactor.clock.realtime_ns())
         if answer.outcome is Outcome.STARTED:
             self.stage.audience.start(self.handles[answer.idcode], client.key, client, client.sink)
         elif answer.outcome is Outcome.STOPPED:
             self.stage.audience.stop(self.handles[answer.idcode], client.key, client)
         self._tell(answer.outcome, client.address, idcode=answer.idcode, code=answer.code, extended=answer.extended)
-        return answer.frame
+        return () if answer.frame is None else self.stage.treat(self.handles[answer.idcode], answer.frame)
 
     def _forget(self, client: _Client) -> None:
         for idcode in client.role.started:
@@ -284,7 +286,7 @@ class UdpOutlet(Outlet):
 
     def _hear(self, source: str, frame: bytes) -> None:
         client = self._clients.pop(source, None) or self._stranger(source)
-        if (answer := self._obey(client, frame)) is not None:
+        for answer in self._obey(client, frame):
             self.outbox.put(answer, client.where, 0)
         if client.role.started:
             self._clients[source] = client
@@ -453,7 +455,7 @@ class TcpOutlet(Outlet):
         if not client.unheard:
             self._read(client)
         for _ in range(min(COMMANDS, len(client.unheard))):
-            if (answer := self._obey(client, client.unheard.popleft().data)) is not None:
+            for answer in self._obey(client, client.unheard.popleft().data):
                 client.put(answer, 0, now_ns)
         if client.unheard:
             self.stage.reactor.again(client.peer, READ)

@@ -15,7 +15,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 
 import numpy as np
@@ -57,6 +57,8 @@ class Senders:
         Bytes that may wait for one TCP client; frames beyond are dropped for it, and counted.
     native
         False takes the portable path: a system call a datagram.
+    treat
+        What becomes of a configuration or header of a stream (by its handle) on its way out: faults.
     stamp_departures
         Have the kernel stamp what leaves unasked, for :meth:`departures`.
     """
@@ -69,6 +71,7 @@ class Senders:
         queue_bytes: int = QUEUE_BYTES,
         native: bool = linux.NATIVE,
         stamp_departures: bool = False,
+        treat: Callable[[int, bytes], Sequence[bytes]] = lambda handle, frame: (frame,),
     ) -> None:
         self._clock = clock
         self._native = native
@@ -89,6 +92,7 @@ class Senders:
             self._batches,
             native,
             stamp_departures,
+            treat,
         )
         self._served: list[Served] = []
         self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
@@ -239,10 +243,16 @@ class Senders:
             sinks = self._spontaneous[handle]
             if not sinks:
                 continue
-            for frame in self._served[handle].announcements(utc_ns):
-                for sink in sinks:
-                    sink.put(frame, 0, 0)
+            for announcement in self._served[handle].announcements(utc_ns):
+                for frame in self._stage.treat(handle, announcement):
+                    for sink in sinks:
+                        sink.put(frame, 0, 0)
         self._flush()
+
+    def inform(self, handle: int) -> None:
+        """Send a stream's configurations to all who get its data."""
+        announcements = self._served[handle].announcements(self._clock.realtime_ns())
+        self.publish([(handle, frame) for told in announcements for frame in self._stage.treat(handle, told)])
 
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         """Answer clients and repeat configurations; waits for something to do at most ``timeout_ns``."""

@@ -317,3 +317,26 @@ def test_no_release_of_ours_changes_a_run() -> None:
         36,
         39,
     ]
+
+
+# --- what clients are told at once
+
+
+def test_configurations_meet_the_faults_that_name_them() -> None:
+    faulty = pipeline(options("corrupt=chk() when=type config", "loss=100%", "disable=0.. "))
+    (told,) = faulty.told(CONFIG_FRAME)
+    assert told != CONFIG_FRAME
+    assert told[:-2] == CONFIG_FRAME[:-2]
+    lossy = pipeline(options("loss=100% when=type config"))
+    assert lossy.told(CONFIG_FRAME) == ()
+    assert [row.fate for row in play(lossy, 3)] == [Fate.SENT] * 3
+    twice = pipeline(options("duplicate=100% when=type config"))
+    assert twice.told(CONFIG_FRAME) == (CONFIG_FRAME, CONFIG_FRAME)
+    assert pipeline(options("loss=50%", "delay=constant(5)", "corrupt=100%")).told(CONFIG_FRAME) == (CONFIG_FRAME,)
+
+
+def test_half_of_the_configurations_are_lost_and_the_data_draw_as_before() -> None:
+    some, none = pipeline(options("loss=50% when=type config or type data")), pipeline(options("loss=50%"))
+    told = [len(some.told(CONFIG_FRAME)) for _ in range(400)]
+    assert 150 < sum(told) < 250
+    assert fates(play(some, 300)) == fates(play(none, 300))

@@ -215,6 +215,10 @@ class Stage:
             return []
         return [self.plays.pop(due[0])] if due else []
 
+    def inform(self, handle: int) -> None:
+        now_ns = self.clock.realtime_ns()
+        self.sent += [Sent(self.now_ns, handle, frame) for frame in self.offered[handle].announcements(now_ns)]
+
     def interrupt(self) -> None:
         """It returns from waiting after each order anyway."""
 

@@ -53,6 +53,8 @@ def parse_control_address(text: str) -> ControlAddress:
         if not match[3].isdecimal() or int(match[3]) > 0xFFFF:
             raise SettingsError(f"{text}: {match[3]!r} is no port; ports are 0..65535")
         return ControlAddress(host=match[1] or match[2], port=int(match[3]))
+    if re.fullmatch(r"\d{1,3}(\.\d{1,3}){3}|localhost|\d{1,5}", text):
+        raise SettingsError(f"{text}: no path, and no port; write 127.0.0.1:PORT, or ./{text} if a path is meant")
     if not hasattr(socket, "AF_UNIX"):
         raise SettingsError(f"{text}: this system has no unix sockets; write 127.0.0.1:PORT")
     if "\0" in text:

@@ -117,8 +117,7 @@ class Delivery:
         handle, offer = int(self._handles[part]), self._offers(part, edition)
         self._senders.replace(handle, offer)
         if extra is None or extra.notice:
-            announcements = offer.announcements(self._clock.realtime_ns())
-            self._senders.publish([(handle, frame) for frame in announcements])
+            self._senders.inform(handle)
 
     def turn(self, gate: Gate) -> None:
         """Hang up on a stream's TCP clients, or let them come back."""

@@ -107,6 +107,7 @@ class Player:
             cfg_period_ns=options.cfg_period_ns or None,
             native=native,
             stamp_departures=stamp_departures,
+            treat=lambda handle, frame: self.pipelines[handle].told(frame),
         )
         try:
             self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(cast.editions)]
