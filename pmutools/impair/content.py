@@ -98,7 +98,7 @@ class Corruption:
         self._size = config.frame_size if config is not None and by_layout else 0
         self._change = kind.change(draws, Scope(config, part.field_, part.station, part.bytes_))
         self._refit = part.refit
-        self._happens = chance(draws, part.fault.p)
+        self.happens = chance(draws, part.fault.p)
         self._selected = selected
         self._last = b""
 
@@ -109,7 +109,7 @@ class Corruption:
         data or not of its size.
         """
         fits = (at.type is FrameType.DATA and len(frame) == self._size) if self._size else len(frame) >= MIN_FRAME_SIZE
-        if not (fits and self._happens(at) and self._selected(at)):
+        if not (fits and self.happens(at) and self._selected(at)):
             if fits and at.type is FrameType.DATA:
                 self._last = frame
             return frame, ""

@@ -253,6 +253,13 @@ class Pipeline:
             config = self._reconfiguration.config(self._active)
         return self._gated(Outgoing(index, 0, data, offset_ns, Fate.SENT, 0, marks, config, self._notice), at)
 
+    def rehearse(self, index: int) -> None:
+        """Draw for a frame and those after it ahead of time: some ms, which the first frame would be late."""
+        at = Moment(index, self._time_ns)
+        for corruption in self._corrupt:
+            corruption.happens(at)
+        self._transmission.rehearse(at)
+
     def told(self, data: bytes) -> tuple[bytes, ...]:
         """What becomes of a frame that a client is told at once: a configuration or a header, asked for or not.
 

@@ -99,6 +99,15 @@ class Transmission:
     def _set_segment(self, parts: tuple[Segment, ...]) -> None:
         self._segmenting = Segmenting(parts, self._draws) if parts else None
 
+    def rehearse(self, at: Moment) -> None:
+        """Draw what is drawn for a frame and those after it, so that it is there when they come."""
+        for lost, _ in self._losses:
+            lost(at)
+        if self._copies is not None:
+            self._copies[0](at)
+        for source, _ in self._delays:
+            source(at)
+
     def copies(self, at: Moment) -> int:
         """How many copies of a frame leave, 0 where it is dropped or lost; for frames that wait for nothing."""
         if any(drops(at) for drops in self._drops) or any(lost(at) and selected(at) for lost, selected in self._losses):

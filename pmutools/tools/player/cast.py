@@ -98,8 +98,11 @@ class Cast:
         """The greatest phase."""
         self._from_ns = self._to_ns = -1
         self._ahead = self._cut(-1, -1)
-        self.editions = self.first_editions()
+        first_rows = self._first_rows()
+        self.editions = reel.rows.edition[first_rows]
         """(P,) the edition that each part begins with."""
+        self.first_numbers = reel.rows.number[first_rows]
+        """(P,) the number, in the recording, of the first frame that each part plays."""
         self._configs: dict[tuple[int, int], StreamConfig] = {}
         self._others: dict[StreamConfig, int] = {}
 
@@ -164,13 +167,12 @@ class Cast:
         first = self.config(part, int(self.editions[part]))
         return (own.name, *own.aliases, *(station.name for station in first.stations))
 
-    def first_editions(self) -> npt.NDArray[np.int32]:
-        """The edition that each part (P,) begins with."""
-        rows = self.reel.rows
-        tracks, firsts = np.unique(rows.track, return_index=True)
-        editions = np.zeros(len(self.reel.tracks), np.int32)
-        editions[tracks] = rows.edition[firsts]
-        return editions[[part.track for part in self.parts]]
+    def _first_rows(self) -> npt.NDArray[np.int64]:
+        """(P,) the row that each part begins with."""
+        tracks, firsts = np.unique(self.reel.rows.track, return_index=True)
+        rows = np.zeros(len(self.reel.tracks), np.int64)
+        rows[tracks] = firsts
+        return rows[[part.track for part in self.parts]]
 
     def edition_of(self, part: int, config: StreamConfig | None, edition: int) -> int:
         """The number of the configuration that a fault gives ``part``'s data; ``edition`` for None."""

@@ -149,6 +149,8 @@ class Player:
         end_ns = None if options.duration_ns is None else clock.monotonic_ns() + options.duration_ns
         if options.listen and not options.to and not self._wait_for_start(end_ns):
             return
+        for part, pipeline in enumerate(self.pipelines):
+            pipeline.rehearse(int(self.cast.first_numbers[part]))
         utc = utc_offset(clock)
         self._plan = plan = Plan(
             self.cast,
