@@ -323,6 +323,8 @@ def _put_phasors(out: npt.NDArray[Any], phasors: npt.NDArray[np.complex128], slo
             out[...] = parts
             return 0
         out[...], over = _int16(parts)
+        blank = (out == INT16_FILLER).all(axis=-1) & ~np.isnan(parts).any(axis=-1)
+        out[blank] = INT16_FILLER + 1  # both parts at their end would read as absent
         return over
     shape = out.shape[:3]
     magnitude, angle = np.abs(counts).reshape(shape), np.angle(counts).reshape(shape)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ from pmutools.c37118.config import (
 from pmutools.c37118.constants import Format
 from pmutools.c37118.framer import Frame, SkipReason
 from pmutools.c37118.frames import wire_values
+from pmutools.c37118.prefix import Prefix
 from pmutools.errors import ChecksumError, ConfigError, EncodeError, LengthError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.tools.describe import describe
@@ -414,3 +416,16 @@ def test_every_byte_fed_is_accounted_for(pieces: list[tuple[int, int, bytes]]) -
         assert tally.fed == tally.framed + tally.skipped_bytes + tally.ignored + demux.pending
     demux.close()
     assert demux.tally.fed == demux.tally.framed + demux.tally.skipped_bytes + demux.tally.ignored
+
+
+def test_a_phasor_beyond_both_ends_of_its_integers_does_not_read_as_absent() -> None:
+    station = Station("A", 7, Format(0), (PhasorChannel("V", 100_000),))
+    config = StreamConfig(7, (station,), 50)
+    prefix = Prefix(FrameType.DATA.sync, config.frame_size, 7, 0, 0, 0)
+    frame = encode_data(wire_values(config, prefix, [[0, 1, 1, 0, 0]]))
+    batch = decode_batch(frame, config)
+    far = replace(batch, phasors=np.full((1, 1), -1e6 - 1e6j), wire=None)
+    octets, clipped = encode_batch(far)
+    assert clipped == 2
+    (back,) = decode_batch(octets.tobytes(), config).phasors[0]
+    assert back == -32767 - 32767j
