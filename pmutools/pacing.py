@@ -5,7 +5,7 @@ Media time (ns) is the source's own time axis; the playback clock maps it to dea
     target(t) = anchor_ns + (t - media_ns) / rate
 
 Every deadline is computed from the one anchor, never from the deadline before it, so errors do not add up. A seek, a
-change of rate, a pause, a loop's wrap and a new file each make a new anchor. All of it is exact integer arithmetic on
+change of rate, a pause and the wrap of an A-B loop each make a new anchor. All of it is exact integer arithmetic on
 arguments; the only clock is the caller's.
 """
 

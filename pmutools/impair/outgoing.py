@@ -43,6 +43,8 @@ class Outgoing(NamedTuple):
     config: StreamConfig | None = None
     notice: bool = True
     write: Segmentation | None = None
+    tag: object = None
+    """Whatever came with the frame."""
     hangup: Hangup = Hangup.SILENCE
 
     @property

@@ -146,6 +146,15 @@ class Pipeline:
         self._fresh = self._fresh and not index.size
         return np.maximum(self._short_cut.many(index), 0)
 
+    @property
+    def by_index(self) -> bool:
+        """Whether nothing but delays that their index decides happens to frames: :meth:`delays_ns` tells them."""
+        return self._delay_of is not None
+
+    def passed(self) -> None:
+        """Frames have passed that :meth:`apply` was not asked about."""
+        self._fresh = False
+
     def act(self, action: Action) -> bool:
         """Do ``enable``, ``disable`` or ``fault`` from the next frame on; False where it does not concern this stream.
 
@@ -197,7 +206,14 @@ class Pipeline:
         return given_up
 
     def apply(
-        self, index: int, data: bytes, offset_ns: int, stream_ns: int | None = None, *, stamp_ns: int | None = None
+        self,
+        index: int,
+        data: bytes,
+        offset_ns: int,
+        stream_ns: int | None = None,
+        *,
+        stamp_ns: int | None = None,
+        tag: object = None,
     ) -> tuple[Outgoing, ...]:
         """What becomes of a frame; a row for each copy, also of those that will not be sent.
 
@@ -214,6 +230,8 @@ class Pipeline:
             Stream time: what it would be at speed 1; ``offset_ns`` where not given.
         stamp_ns
             The stamp as recorded, POSIX UTC, for selectors; where not given, the one that ``data`` carries.
+        tag
+            Comes back with each copy, whenever that is.
 
         Returns
         -------
@@ -230,7 +248,7 @@ class Pipeline:
             else:
                 self._others += 1
                 self._fresh = self._fresh or frame_type.is_config
-            return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns),)
+            return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns, tag=tag),)
         time_ns = offset_ns if stream_ns is None else stream_ns
         self._time_ns, self._offset_ns = time_ns, offset_ns
         while self._actions and self._actions[0].at_ns <= time_ns:
@@ -251,7 +269,8 @@ class Pipeline:
         if self._altered:
             data, at, marks = self._spoilt(data, at)
             config = self._reconfiguration.config(self._active)
-        return self._gated(Outgoing(index, 0, data, offset_ns, Fate.SENT, 0, marks, config, self._notice), at)
+        row = Outgoing(index, 0, data, offset_ns, Fate.SENT, 0, marks, config, self._notice, tag=tag)
+        return self._gated(row, at)
 
     def rehearse(self, index: int) -> None:
         """Draw for a frame and those after it ahead of time: some ms, which the first frame would be late."""

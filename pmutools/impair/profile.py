@@ -43,11 +43,19 @@ class StreamRule(NamedTuple):
     settings: tuple[tuple[str, Setting], ...]
 
     def matches(self, names: Iterable[str]) -> bool:
-        return any(fnmatchcase(name.casefold(), pattern.casefold()) for name in names for pattern in self.patterns)
+        return any(_fits(name.casefold(), pattern.casefold()) for name in names for pattern in self.patterns)
 
     def among(self, names: Iterable[str]) -> tuple[str, ...]:
         """Those of ``names`` that a pattern fits."""
         return tuple(name for name in names if self.matches((name,)))
+
+
+def _fits(name: str, pattern: str) -> bool:
+    """Whether a pattern fits; most are plain names, which need no search: an order may ask thousands of streams."""
+    return fnmatchcase(name, pattern) if _WILD & set(pattern) else name == pattern
+
+
+_WILD = frozenset("*?[")
 
 
 class Action(NamedTuple):

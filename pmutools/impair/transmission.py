@@ -140,7 +140,7 @@ class Transmission:
             if self._keep_order:
                 leaves_ns = self._last_ns = max(leaves_ns, self._last_ns)
             late_ns = leaves_ns - row.offset_ns
-            out = Outgoing(row.index, copy, row.data, leaves_ns, Fate.SENT, late_ns, row.marks, row.config, row.notice)
+            out = row._replace(copy=copy, offset_ns=leaves_ns, delay_ns=late_ns)
             rows += self._link(self._reordered(Leaving(out, then))) if self._after else (out,)
         return rows
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
-from support.playing import MS, Played, Stage, config_of, faults, interleaved, play, recording, stream
+from support.playing import MS, START_NS, Played, Stage, config_of, faults, interleaved, play, recording, stream
 from support.recordings import write
 
 from pmutools.c37118 import AnalogChannel, Format, FrameType, PhasorChannel, Station, StreamConfig, decode_data
@@ -318,3 +319,24 @@ def test_configurations_that_a_fault_makes_are_announced() -> None:
     played = play(two(), orders={NS + 15 * MS: "fault N1 config=count()"})
     announced = [config_of(sent) for sent in played.stage.sent if sent.type is FrameType.CFG2]
     assert [(config.idcode, config.stations[0].cfgcnt) for config in announced] == [(1, 1)]
+
+
+# --- what is held back, and seeks
+
+
+@pytest.mark.parametrize("silence", ["disable 7 release=burst", "fault 7 reorder=100% depth=50"])
+def test_a_seek_amid_what_is_held_back_gives_every_copy_its_own_stamp(silence: str, tmp_path: Path) -> None:
+    """Indices repeat when a player goes back; what is held of them keeps its origin."""
+    ledger = tmp_path / "ledger.parquet"
+    orders = {1 * NS + NS // 2: silence, 2 * NS: "seek 0", 3 * NS + NS // 2: "enable 7\nfault 7 reorder=none"}
+    played = play(recording(stream(), 150), orders=orders, ledger=ledger)
+    rows = pq.read_table(ledger).to_pylist()
+    assert [row["source_time_ns"] for row in rows] == [START_NS + row["index"] * 20 * MS for row in rows]
+    assert {(row["time_ns"] - row["source_time_ns"]) % NS for row in rows} == {0}
+    assert len(played.data) == sum(row["fate"] == "sent" for row in rows)
+
+
+def test_b_may_be_as_late_as_the_last_frame() -> None:
+    source = recording(stream(), 200, latency_ns=lambda k: 400 * MS if k == 199 else 5 * MS)
+    played = play(source, orders={0: "loop 3.5 4.4"}, loops=1, duration_ns=8 * NS)
+    assert set(played.numbers()) == {*range(175, 200)}

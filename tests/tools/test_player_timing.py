@@ -23,7 +23,7 @@ from support.playing import (
     stream,
 )
 
-from pmutools.c37118 import FrameType, decode_config, decode_prefix
+from pmutools.c37118 import Format, FrameType, PhasorChannel, Station, StreamConfig, decode_config, decode_prefix
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.session import Served
 from pmutools.clock import VirtualClock
@@ -453,3 +453,22 @@ def test_emulated_phases_go_on_over_loops() -> None:
         assert spaced(played.times(part), 20 * MS)
         assert spaced(played.stamps(part), 20 * MS)
     assert len(played.data) == 7 * 150
+
+
+def test_a_spread_in_frequency_follows_the_stamps_whatever_the_frames_sizes() -> None:
+    """An offset turns the angle with time: the same for a stream alone and beside one of other frames."""
+
+    def cast(reel: Reel) -> Cast:
+        return emulated(reel, len(reel.tracks), 3, stagger=False, spread=Spread(mhz=500))
+
+    wide = StreamConfig(9, (Station("WIDE", 9, Format(0), (PhasorChannel("V1", 100), PhasorChannel("V2", 100))),), 50)
+    alone = play(recording(stream(7), 60), clock=clock(), cast=cast)
+    beside = play(interleaved(recording(stream(7), 60), recording(wide, 60)), clock=clock(), cast=cast)
+    assert [sent.frame[14:-2] for sent in beside.data if sent.stream == 0] == [s.frame[14:-2] for s in alone.data]
+
+
+def test_fewer_pmus_than_streams_play_the_first_ones() -> None:
+    source = interleaved(recording(stream(7), 100), recording(stream(8), 100, first_slot=5000))
+    played = play(source, clock=clock(), cast=lambda reel: emulated(reel, 1, seed=1))
+    assert played.numbers() == [*range(100)]
+    assert played.stage.now_ns < 4 * NS, "nobody waits for the other one"

@@ -22,11 +22,10 @@ from pmutools.c37118.constants import NAME_SIZE, PREFIX_SIZE
 from pmutools.errors import SettingsError
 from pmutools.parsers import bind, call, parsed_by
 from pmutools.timebase import NS
-from pmutools.tools.player.reel import I64, Reel, Track
+from pmutools.tools.player.reel import I64, Reel, Track, of_tracks
 
 AHEAD_NS = 20_000_000
 """Frames are looked up this far ahead at once."""
-"""Where SOC, time quality and FRACSEC are in a frame."""
 IDCODES = 65_534
 """IDCODE 0 means none, 65535 is reserved."""
 
@@ -213,9 +212,11 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
 
     ``stagger`` spreads their phases evenly over a reporting interval. Raises SettingsError for more PMUs than IDCODEs.
     """
-    first = reel.tracks[0].config.idcode
     if not 1 <= count <= IDCODES:
         raise SettingsError(f"--emulate {count}: between 1 and {IDCODES} PMUs have IDCODEs of their own")
+    if count < len(reel.tracks):
+        reel = of_tracks(reel, count)
+    first = reel.tracks[0].config.idcode
     parts = []
     for number in range(count):
         place = number % len(reel.tracks)

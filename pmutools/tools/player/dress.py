@@ -46,7 +46,7 @@ def dress(
             else:
                 write_stamps(frames, *timebase.from_ns_array(stamps, reel.time_bases[edition[chosen]]))
         if cast.emulated:
-            _alter(cast, frames, rows[chosen], parts[chosen], stamps_ns)
+            _alter(cast, frames, rows[chosen], parts[chosen], None if stamps_ns is None else stamps_ns[chosen])
             write_idcodes(frames, cast.idcodes[parts[chosen]])
         if cast.emulated or stamps_ns is not None:
             seal(frames)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pmutools.formats.files import OutputFile
 from pmutools.impair.outgoing import LedgerRow
 from pmutools.tools.player.reel import I64
-from pmutools.tools.player.sheet import FATES, SENT, Sheet
+from pmutools.tools.player.sheet import EMPTY, FATES, SENT, Sheet
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -60,7 +60,8 @@ class LedgerWriter:
     def add(self, sheet: Sheet, fate: npt.NDArray[np.uint8], sent_ns: I64) -> None:
         """Copies (N,) as they were dealt with: their fates, and when those sent had left (ns from the start)."""
         tx_stamp_ns = np.full(len(sheet), NO_STAMP)
-        self._pages.append(_Page(self.rows, sheet, fate, sent_ns, tx_stamp_ns))
+        columns = replace(sheet, wire=EMPTY.wire)  # the bytes would be most of it
+        self._pages.append(_Page(self.rows, columns, fate, sent_ns, tx_stamp_ns))
         self.rows += len(sheet)
         if self.rows - self._pages[0].first >= GROUP_ROWS + _WAIT_ROWS:
             self._write(_WAIT_ROWS)

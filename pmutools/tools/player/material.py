@@ -92,7 +92,8 @@ def _recast(choice: Choice, opened: Callable[[], Items], changes: Changes) -> It
 
     if choice.pdc_idcode is None:
         return items(changes)
-    return concentrated(lambda: items(None), choice.pdc_idcode, changes=changes)
+    passes = iter((None, changes))  # it is read twice, and told of once
+    return concentrated(lambda: items(next(passes)), choice.pdc_idcode, changes=changes)
 
 
 def _timed(choice: Choice, reel: Reel) -> tuple[Reel, list[str]]:

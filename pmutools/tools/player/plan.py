@@ -194,7 +194,8 @@ class Plan:
 
     def _round_end(self) -> int:
         start_ns, end_ns = self._round_start(self._loop), self._round_start(self._loop + 1)
-        return max(end_ns, start_ns + self._span_ns) if self._last_round else end_ns
+        last = self._last_round or self.between_ns is not None  # B may be as late as the last frame
+        return max(end_ns, start_ns + self._span_ns) if last else end_ns
 
     def _rounds(self) -> list[int]:
         """The rounds that rows at the cursor may belong to: the present one, and one whose last frames are late."""
@@ -263,7 +264,7 @@ class Plan:
         if not len(sheet):
             return
         if buckets[0] == buckets[-1]:
-            self._waiting.setdefault(int(buckets[0]), []).append(sheet)
+            self._waiting.setdefault(int(buckets[0]), []).append(sheet.compact())
             return
         edges = np.flatnonzero(np.diff(buckets)) + 1
         for first, last in zip([0, *edges], [*edges, len(sheet)], strict=True):
@@ -319,6 +320,8 @@ class Plan:
                 self.between_ns = None
             case ["loop", Place() as a, Place() as b]:
                 self._loop_between(offset_ns, self._position(a), self._position(b))
+            case _:
+                raise AssertionError(f"{action} is no order to a player")
 
     def _catch_up(self, offset_ns: int) -> None:
         """Bring the cursor to where it is at ``offset_ns``, but not beyond what is to leave, or to be done, before."""
@@ -331,7 +334,7 @@ class Plan:
 
     def _loop_between(self, offset_ns: int, first_ns: int, last_ns: int) -> None:
         """Play a part of the recording over and over; a part of less than a reporting interval is refused."""
-        last_ns = min(last_ns, self._round_end() - self._round_start(self._loop))
+        last_ns = min(last_ns, max(self._span_ns, self._round_start(1)))
         if last_ns - first_ns < round(self._period_ns):
             raise SettingsError(
                 f"a loop from {first_ns / NS:g} s to {last_ns / NS:g} s is shorter than a reporting interval"

@@ -300,29 +300,27 @@ class Player:
             return
         if self._state is PlayState.ENDED:
             raise SettingsError("the play has ended")
-        if action.verb in STREAM_VERBS:
-            names = [self.cast.names(part) for part in range(len(self.cast.parts))]
-            if action.rule is not None and not any(map(action.rule.matches, names)):
-                there = ", ".join(part.name for part in self.cast.parts[:20])
-                raise SettingsError(
-                    f"{action.verb} {', '.join(action.rule.patterns)}: no such stream; there are {there}"
-                )
-        elif action.verb == "step" and not (self._plan is not None and self._plan.paused):
+        if action.verb == "step" and not (self._plan is not None and self._plan.paused):
             raise SettingsError("step goes on by frames from a pause; pause first")
         if self._plan is not None:
             self._do(action)
             self.senders.interrupt()  # something may be due before what is waited for
             return
-        for pipeline in self.pipelines:
-            pipeline.check(action)
+        self._meant(action, [part for part, pipeline in enumerate(self.pipelines) if pipeline.check(action)])
         self._actions.append(action)
 
     def _do(self, action: Action) -> None:
         assert self._plan is not None
         if action.verb in STREAM_VERBS:
-            self._plan.fault(action)
+            self._meant(action, self._plan.fault(action))
         else:
             self._plan.act(action, self.clock.monotonic_ns() - self._anchor_ns)
+
+    def _meant(self, action: Action, parts: Sequence[int]) -> None:
+        """Raise SettingsError for an order to streams that concerns none."""
+        if action.rule is not None and not parts:
+            there = ", ".join(part.name for part in self.cast.parts[:20])
+            raise SettingsError(f"{action.verb} {', '.join(action.rule.patterns)}: no such stream; there are {there}")
 
     def status(self) -> PlayerStatus:
         """What it is doing now."""

@@ -1,6 +1,6 @@
 """A recording as the player wants it: read once, each frame with the time at which it is due, in that order.
 
-Columns of a row a frame (about 40 bytes) are in memory; the frames themselves go to a temporary file where they are
+Columns of a row a frame (some 50 bytes) are in memory; the frames themselves go to a temporary file where they are
 more than :data:`SPOOL_BYTES`, and the operating system keeps of it what is needed. So any time of any recording can be
 gone to at once, and a loop reads nothing again.
 """
@@ -266,6 +266,11 @@ def _chosen(tracks: Sequence[Track], select: Collection[str], exclude: Collectio
                 raise SettingsError(f"{option} {name}: no such stream; there are {there}")
     kept = [place for place, track in enumerate(tracks) if not select or any(name in select for name in track.names)]
     return [place for place in kept if not any(name in exclude for name in tracks[place].names)]
+
+
+def of_tracks(reel: Reel, count: int) -> Reel:
+    """The reel's first ``count`` tracks alone; its rounds stay as long as they are."""
+    return replace(reel, tracks=reel.tracks[:count], rows=reel.rows[reel.rows.track < count])
 
 
 # --- other times for the same frames --------------------------------------------------------------------------------

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from pmutools.flow import Hangup
-from pmutools.impair.outgoing import Fate, Outgoing
+from pmutools.impair.outgoing import Outgoing
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Action
 from pmutools.tools.player.cast import Cast
@@ -34,8 +34,9 @@ class Gate(NamedTuple):
 
 
 class _Origin(NamedTuple):
-    """What a ledger wants to know of a frame that a pipeline may hold back."""
+    """Whose a frame is that a pipeline may hold back, and what a ledger wants to know of it."""
 
+    part: int
     source_ns: int
     stamp_ns: int
     edition: int
@@ -47,22 +48,21 @@ _CLEAR, _DELAYED, _BUSY = range(3)
 class Route:
     """Every stream's way through its pipeline; what is held back there keeps its origin here."""
 
-    def __init__(self, cast: Cast, pipelines: Sequence[Pipeline], *, marks: bool) -> None:
-        self._cast, self._pipelines, self._marks = cast, pipelines, marks
-        self._origins: list[dict[int, _Origin]] = [{} for _ in pipelines]
-        self._edition = cast.editions.copy()
+    def __init__(self, cast_: Cast, pipelines: Sequence[Pipeline], *, marks: bool) -> None:
+        self._cast, self._pipelines, self._marks = cast_, pipelines, marks
+        self._edition = cast_.editions.copy()
         self.gates: list[Gate] = []
         self.warnings: list[str] = []
         self._hung: dict[int, Hangup | None] = {}
         self._mode = np.array([_mode(pipeline) for pipeline in pipelines], np.int8)
 
     def act(self, action: Action) -> list[int]:
-        for part in np.flatnonzero(self._mode == _CLEAR).tolist():
-            self._pipelines[part].delays_ns(np.zeros(1, np.int64))  # it has not seen the frames that passed it by
-        for pipeline in self._pipelines:  # of several streams, all or none
-            pipeline.check(action)
-        concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.act(action)]
+        # of several streams, all or none
+        concerned = [part for part, pipeline in enumerate(self._pipelines) if pipeline.check(action)]
         for part in concerned:
+            if self._mode[part] == _CLEAR:
+                self._pipelines[part].passed()
+            self._pipelines[part].act(action)
             self._set_mode(part)
         return concerned
 
@@ -137,65 +137,55 @@ class Route:
 
     def _apply(self, sheet: Sheet, rows: npt.NDArray[np.int64], stream_ns: I64) -> Sheet:
         """Frames that go through their pipelines one by one."""
-        out: list[tuple[int, Outgoing, _Origin]] = []
+        out: list[Outgoing] = []
         for row in rows.tolist():
-            part = int(sheet.part[row])
-            pipeline, origins, index = self._pipelines[part], self._origins[part], int(sheet.index[row])
-            source_ns = int(sheet.source_ns[row])
-            origins[index] = _Origin(source_ns, int(sheet.stamp_ns[row]), int(sheet.edition[row]))
-            done = pipeline.apply(
-                index, sheet.frame(row), int(sheet.offset_ns[row]), int(stream_ns[row]), stamp_ns=source_ns
-            )
-            self._take(part, done, out)
+            part, source_ns, offset_ns = int(sheet.part[row]), int(sheet.source_ns[row]), int(sheet.offset_ns[row])
+            pipeline = self._pipelines[part]
+            origin = _Origin(part, source_ns, int(sheet.stamp_ns[row]), int(sheet.edition[row]))
+            index, frame = int(sheet.index[row]), sheet.frame(row)
+            out += pipeline.apply(index, frame, offset_ns, int(stream_ns[row]), stamp_ns=source_ns, tag=origin)
             hangup = None if pipeline.hangup is Hangup.SILENCE else pipeline.hangup
             if hangup is not self._hung.get(part):
                 self._hung[part] = hangup
-                self.gates.append(Gate(int(sheet.offset_ns[row]), part, hangup))
+                self.gates.append(Gate(offset_ns, part, hangup))
             if pipeline.refused:
                 self.warnings += pipeline.refused
                 pipeline.refused.clear()
             if not pipeline.holding:
-                origins.clear()
                 self._set_mode(part)
         return self._sheet(out)
 
-    def _take(self, part: int, done: Sequence[Outgoing], out: list[tuple[int, Outgoing, _Origin]]) -> None:
-        origins = self._origins[part]
-        for copy in done:
-            out.append((part, copy, origins[copy.index]))
-            if copy.fate is Fate.DISABLED:  # it was held at most once, and will not come again
-                del origins[copy.index]
-
     def end(self) -> Sheet:
         """What the pipelines still hold back."""
-        out: list[tuple[int, Outgoing, _Origin]] = []
-        for part, pipeline in enumerate(self._pipelines):
-            if self._mode[part] == _BUSY:
-                self._take(part, pipeline.close(), out)
-        return self._sheet(out)
+        busy = np.flatnonzero(self._mode == _BUSY).tolist()
+        return self._sheet([copy for part in busy for copy in self._pipelines[part].close()])
 
-    def _sheet(self, out: Sequence[tuple[int, Outgoing, _Origin]]) -> Sheet:
+    def _sheet(self, out: Sequence[Outgoing]) -> Sheet:
         if not out:
             return EMPTY
-        nbytes = np.array([len(copy.data) for _, copy, _ in out], np.int64)
+        origins = [cast(_Origin, copy.tag) for copy in out]
+        nbytes = np.array([len(copy.data) for copy in out], np.int64)
         faults, extra = np.empty(len(out), np.object_), np.empty(len(out), np.object_)
-        for row, (_, copy, _) in enumerate(out):
-            faults[row] = copy.faults if self._marks else ""
-            extra[row] = _extra(copy)
+        faults[:] = [copy.faults if self._marks else "" for copy in out]
+        extra[:] = [_extra(copy) for copy in out]
+        editions = [
+            self._cast.edition_of(origin.part, copy.config, origin.edition)
+            for copy, origin in zip(out, origins, strict=True)
+        ]
         return Sheet(
-            np.array([copy.offset_ns for _, copy, _ in out], np.int64),
-            np.array([part for part, _, _ in out], np.int32),
-            np.array([copy.index for _, copy, _ in out], np.int64),
-            np.array([copy.copy for _, copy, _ in out], np.int32),
-            np.array([origin.source_ns for *_, origin in out], np.int64),
-            np.array([origin.stamp_ns for *_, origin in out], np.int64),
-            np.array([_FATE_CODES[copy.fate] for _, copy, _ in out], np.uint8),
-            np.array([self._cast.edition_of(part, copy.config, o.edition) for part, copy, o in out], np.int32),
-            faults,
-            extra,
-            np.cumsum(nbytes) - nbytes,
-            nbytes,
-            np.frombuffer(b"".join(copy.data for _, copy, _ in out), np.uint8),
+            offset_ns=np.array([copy.offset_ns for copy in out], np.int64),
+            part=np.array([origin.part for origin in origins], np.int32),
+            index=np.array([copy.index for copy in out], np.int64),
+            copy=np.array([copy.copy for copy in out], np.int32),
+            source_ns=np.array([origin.source_ns for origin in origins], np.int64),
+            stamp_ns=np.array([origin.stamp_ns for origin in origins], np.int64),
+            fate=np.array([_FATE_CODES[copy.fate] for copy in out], np.uint8),
+            edition=np.array(editions, np.int32),
+            faults=faults,
+            extra=extra,
+            at=np.cumsum(nbytes) - nbytes,
+            nbytes=nbytes,
+            wire=np.frombuffer(b"".join(copy.data for copy in out), np.uint8),
         )
 
 
@@ -210,4 +200,4 @@ _ORDINARY = Extra()
 def _mode(pipeline: Pipeline) -> int:
     if pipeline.clear:
         return _CLEAR
-    return _BUSY if pipeline.delays_ns(np.zeros(0, np.int64)) is None else _DELAYED
+    return _DELAYED if pipeline.by_index else _BUSY
