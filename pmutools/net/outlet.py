@@ -18,7 +18,7 @@ from pmutools.c37118.checksum import chk
 from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.framer import Frame, Framer
 from pmutools.c37118.session import Outcome, Served, ServerRole
-from pmutools.errors import SourceError
+from pmutools.errors import PmuError, SourceError
 from pmutools.flow import Hangup, Segmentation
 from pmutools.net.audience import Audience, Flushable, Outbox, Sink, UdpSink
 from pmutools.net.endpoint import Endpoint, Scheme, scoped
@@ -286,8 +286,13 @@ class UdpOutlet(Outlet):
 
     def _hear(self, source: str, frame: bytes) -> None:
         client = self._clients.pop(source, None) or self._stranger(source)
-        for answer in self._obey(client, frame):
-            self.outbox.put(answer, client.where, 0)
+        try:
+            for answer in self._obey(client, frame):
+                self.outbox.put(answer, client.where, 0)
+        except PmuError as error:
+            self._forget(client)
+            self._tell(ServerKind.DISCONNECTED, client.address, str(error))
+            return
         if client.role.started:
             self._clients[source] = client
         while len(self._clients) > MAX_CLIENTS:
@@ -297,12 +302,31 @@ class UdpOutlet(Outlet):
 
     def _stranger(self, source: str) -> _UdpClient:
         host, _, port = source.rpartition(":")
-        address = resolve(host.strip("[]"), int(port), datagram=True, family=self.address.family)
+        address = self.address.at(host.strip("[]"), int(port))  # on the link of this socket, where it is bound to one
         return _UdpClient(address, ServerRole(self.streams), source, self.outbox)
 
 
+class _DataPort:
+    """Where the data of ``tcp+udp://`` go: to a host of their own, or to a port of whoever has connected."""
+
+    def __init__(self, endpoint: Endpoint, stage: Stage) -> None:
+        host = scoped(endpoint.data_host or endpoint.host, endpoint.iface)
+        where = resolve(host, endpoint.data_port or 0, datagram=True)
+        self._outbox = stage.outbox(where, endpoint)
+        self._port = where.port
+        self._fixed = where if endpoint.data_host else None
+
+    def of(self, peer: TcpPeer) -> tuple[Hashable, Callable[[], Sink]]:
+        """What a client shares with all whose data go to the same place, and what makes that sink."""
+        where = self._fixed or peer.address.at(peer.address.host, self._port)
+        return where, lambda: UdpSink(self._outbox, target(where))
+
+
 class TcpOutlet(Outlet):
-    """Commands over TCP; data on the same connection, or over UDP to the client's (or a group's) data port."""
+    """Commands over TCP; data on the same connection, or over UDP to the client's (or a group's) data port.
+
+    What data over UDP need is had when the endpoint is opened, so that what cannot be is no client's affair.
+    """
 
     def __init__(
         self,
@@ -314,12 +338,13 @@ class TcpOutlet(Outlet):
         queue_bytes: int,
     ) -> None:
         super().__init__(index, endpoint, streams, handles, stage)
+        self._data = _DataPort(endpoint, stage) if endpoint.scheme is Scheme.TCP_UDP else None
         self._listener: TcpListener | None = TcpListener(endpoint.host, endpoint.port)
         self.address = self._listener.address
         self._relisten: Timer | None = None
         self._queue_bytes = queue_bytes
         self._clients: set[_TcpClient] = set()
-        self._lost: list[tuple[_TcpClient, OSError]] = []
+        self._lost: list[tuple[_TcpClient, OSError | PmuError]] = []
         self._listen()
 
     def close(self) -> None:
@@ -360,8 +385,8 @@ class TcpOutlet(Outlet):
     def watch(self, client: _TcpClient, events: int) -> None:
         self.stage.reactor.watch(client.peer, events, lambda ready: self._ready(client, ready))
 
-    def lose(self, client: _TcpClient, error: OSError) -> None:
-        """A send has failed, perhaps amid publishing: the client goes with the next :meth:`flush`."""
+    def lose(self, client: _TcpClient, error: OSError | PmuError) -> None:
+        """A send has failed, perhaps amid publishing, or an answer: the client goes with the next :meth:`flush`."""
         self._lost.append((client, error))
         self.stage.dirty.append(self)
 
@@ -370,6 +395,8 @@ class TcpOutlet(Outlet):
         for client, error in lost:
             if isinstance(error, CutOff):
                 self._drop(client, ServerKind.CUT_OFF, str(error.strerror), reset=True)
+            elif isinstance(error, PmuError):
+                self._drop(client, ServerKind.DISCONNECTED, str(error))
             else:
                 self._drop(client, ServerKind.DISCONNECTED, str(explain(error, client.address)))
         return []
@@ -431,11 +458,8 @@ class TcpOutlet(Outlet):
 
     def _welcome(self, peer: TcpPeer) -> None:
         client = _TcpClient(peer, ServerRole(self.streams), self)
-        if self.endpoint.scheme is Scheme.TCP_UDP:
-            host, port = self.endpoint.data_host or peer.address.host, self.endpoint.data_port or 0
-            address = resolve(scoped(host, self.endpoint.iface), port, datagram=True)
-            client.key = address
-            client.sink = lambda: UdpSink(self.stage.outbox(address, self.endpoint), target(address))
+        if self._data is not None:
+            client.key, client.sink = self._data.of(peer)
         self._clients.add(client)
         self.watch(client, READ)
         self._tell(ServerKind.CONNECTED, peer.address)
@@ -447,7 +471,7 @@ class TcpOutlet(Outlet):
                 client.flush(now_ns)
             if events & READ:
                 self._hear(client, now_ns)
-        except OSError as error:
+        except (OSError, PmuError) as error:
             self.lose(client, error)
         self.flush()
 

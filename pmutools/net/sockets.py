@@ -33,6 +33,12 @@ class Address(NamedTuple):
     def port(self) -> int:
         return self.sockaddr[1]
 
+    def at(self, host: str, port: int) -> Address:
+        """Another numeric address, of the same family and on the same link."""
+        if len(self.sockaddr) == 4:
+            return Address(self.family, (host, port, 0, self.sockaddr[3]))
+        return Address(self.family, (host, port))
+
     def __str__(self) -> str:
         return join_host(self.host, self.port)
 

@@ -252,6 +252,64 @@ def test_data_to_a_group_are_not_stopped_by_one_of_its_readers() -> None:
         assert Outcome.STOPPED not in server.kinds()
 
 
+@pytest.mark.parametrize(
+    ("data", "error", "match"),
+    [
+        ("no.such.host.invalid:4713", SourceError, "unknown host"),
+        ("239.192.9.3:4713&iface=nic9", SettingsError, "iface=nic9: neither an address nor an interface"),
+        ("4713&source=192.0.2.123", SourceError, "does not have that address"),
+    ],
+)
+def test_where_data_cannot_go_is_told_at_the_start(data: str, error: type[Exception], match: str) -> None:
+    with Senders(CLOCK) as senders, pytest.raises(error, match=match):
+        senders.listen(parse_endpoint(f"tcp+udp://127.0.0.1:0?data={data}"), [senders.add(served(CONFIG))])
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+@pytest.mark.parametrize("scheme", ["udp+cmd", "tcp+udp"])
+def test_clients_are_sent_to_without_asking_for_names(scheme: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That takes its time, and may fail."""
+    ipv6 = host != "127.0.0.1"
+    with socket.socket(socket.AF_INET6 if ipv6 else socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((host.strip("[]"), 0))
+        sock.settimeout(1)
+        data = f"?data={sock.getsockname()[1]}" if scheme == "tcp+udp" else ""
+        with serving(f"{scheme}://{host}:0{data}") as server, ExitStack() as stack:
+            address = server.address
+            monkeypatch.setattr(socket, "getaddrinfo", lambda *_: pytest.fail("a name was asked for"))
+            if scheme == "tcp+udp":
+                tcp_sock = stack.enter_context(socket.socket(sock.family, socket.SOCK_STREAM))
+                tcp_sock.connect(address)
+                tcp_sock.sendall(START)
+            else:
+                sock.sendto(START, address)
+            server.until(lambda: Outcome.STARTED in server.kinds())
+            server.publish(1)
+            assert sock.recv(100) == data_frame(CONFIG, 0, value=0)
+
+
+def refuse(handle: int, frame: bytes) -> list[bytes]:
+    raise SettingsError("no such fault")
+
+
+def test_a_command_that_cannot_be_answered_costs_its_client_the_connection_and_nobody_else() -> None:
+    with serving("tcp://127.0.0.1:0", treat=refuse) as server, clients(server, 2) as (one, other):
+        one.say(encode_command(7, Command.SEND_CFG2))
+        server.until(lambda: ServerKind.DISCONNECTED in server.kinds())
+        assert server.events[-1].detail == "no such fault"
+        started(server, other)
+
+
+def test_a_command_that_cannot_be_answered_costs_its_udp_client_what_it_has_started() -> None:
+    with serving("udp+cmd://127.0.0.1:0", treat=refuse) as server:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.sendto(START, server.address)
+            sock.sendto(encode_command(7, Command.SEND_CFG2), server.address)
+            server.until(lambda: ServerKind.DISCONNECTED in server.kinds())
+        assert server.events[-1].detail == "no such fault"
+        assert server.senders.audience(server.handles[0]) == 0
+
+
 # --- clients that misbehave
 
 
