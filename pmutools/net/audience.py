@@ -61,11 +61,11 @@ class Addresses(NamedTuple):
 class Outbox:
     """What one UDP socket sends: single frames with its next flush, and columns of frames, loaded and sent in runs.
 
-    It enters itself in ``dirty`` when there is something to flush. With ``stamped`` the kernel stamps departures, and
-    :attr:`marks` remembers whose they are.
+    It enters itself in ``dirty`` when there is something to flush. With ``stamped`` the kernel stamps
+    :attr:`departures`.
     """
 
-    def __init__(self, sock: UdpSocket, dirty: list[Flushable], *, stamped: bool = False) -> None:
+    def __init__(self, sock: UdpSocket, dirty: dict[Flushable, None], *, stamped: bool = False) -> None:
         self.sock = sock
         self._dirty = dirty
         self._frames: list[bytes] = []
@@ -77,12 +77,13 @@ class Outbox:
 
     def put(self, frame: bytes, where: Target, mark: int) -> None:
         if not self._frames:
-            self._dirty.append(self)
+            self._dirty[self] = None
         self._frames.append(frame)
         self._targets.append(where)
         self._marks.append(mark)
 
     def flush(self) -> list[int]:
+        self._dirty.pop(self, None)
         if not self._frames:
             return []
         failed = self.sock.send(self._frames, self._targets)

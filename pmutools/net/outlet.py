@@ -78,7 +78,8 @@ class Stage(NamedTuple):
     reactor: Reactor
     audience: Audience
     tell: Callable[[ServerEvent], None]
-    dirty: list[Flushable]
+    dirty: dict[Flushable, None]
+    """Who is to be flushed, in this order; they take themselves out as they are."""
     outbox: Callable[[Address, Endpoint], Outbox]
     """The box of the socket that sends to an address, in the way an endpoint asks for."""
     batches: Batches | None
@@ -388,9 +389,10 @@ class TcpOutlet(Outlet):
     def lose(self, client: _TcpClient, error: OSError | PmuError) -> None:
         """A send has failed, perhaps amid publishing, or an answer: the client goes with the next :meth:`flush`."""
         self._lost.append((client, error))
-        self.stage.dirty.append(self)
+        self.stage.dirty[self] = None
 
     def flush(self) -> list[int]:
+        self.stage.dirty.pop(self, None)
         lost, self._lost = self._lost, []
         for client, error in lost:
             if isinstance(error, CutOff):

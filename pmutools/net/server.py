@@ -82,7 +82,7 @@ class Senders:
         self._audience = Audience()
         self._events: list[ServerEvent] = []
         self._interrupted = False
-        self._dirty: list[Flushable] = []
+        self._dirty: dict[Flushable, None] = {}
         self._stage = Stage(
             self._reactor,
             self._audience,
@@ -331,7 +331,7 @@ class Senders:
     def _flush(self) -> list[int]:
         failed: list[int] = []
         while self._dirty:
-            failed += self._dirty.pop().flush()
+            failed += next(iter(self._dirty)).flush()
         return failed
 
     def _box(self, where: Address, endpoint: Endpoint) -> Outbox:

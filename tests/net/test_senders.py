@@ -443,6 +443,23 @@ def test_a_flood_delays_nobody(kind: str) -> None:
         assert sorted(late_ns)[len(late_ns) * 9 // 10] < 10 * MS, sorted(late_ns)
 
 
+@pytest.mark.parametrize("scheme", ["tcp", "udp+cmd"])
+def test_answers_leave_nothing_behind_where_nothing_is_published(scheme: str) -> None:
+    ask = encode_command(7, Command.SEND_CFG2)
+    with serving(f"{scheme}://127.0.0.1:0") as server, ExitStack() as stack:
+        kind = socket.SOCK_STREAM if scheme == "tcp" else socket.SOCK_DGRAM
+        for k in range(1, 21):
+            sock = stack.enter_context(socket.socket(socket.AF_INET, kind))
+            sock.connect(server.address)
+            sock.send(ask)
+            server.until(lambda k=k: server.kinds().count(Outcome.ANSWERED) == k)  # type: ignore[misc]
+            if scheme == "tcp":  # it goes with RST
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                sock.close()
+                server.until(lambda k=k: server.kinds().count(ServerKind.DISCONNECTED) == k)  # type: ignore[misc]
+        assert len(server.senders._dirty) == 0
+
+
 def test_many_flooding_clients_share_the_turns() -> None:
     wire = frames_of(Command.SEND_CFG2, 5_000)
     with serving("tcp://127.0.0.1:0") as server, clients(server, 40) as joined:
