@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -16,7 +18,7 @@ from pmutools.net.udp import Target, UdpSocket
 I64 = npt.NDArray[np.int64]
 NO_ROW = -1
 _REMEMBERED = 1 << 18
-"""Datagrams whose departure stamps are waited for: two seconds of 100,000/s."""
+"""Datagrams whose departure stamps are waited for, and stamps that wait to be read: two seconds of 100,000/s."""
 _NONE = np.zeros(0, np.int64)
 
 
@@ -123,13 +125,19 @@ class Outbox:
 
 
 class Departures:
-    """The kernel's stamps of when datagrams left, matched with whose they are."""
+    """The kernel's stamps of when datagrams left, matched with whose they are.
+
+    It remembers as many as may wait for their stamps, and as many stamps that nobody has read yet: the newest.
+    """
 
     def __init__(self, sock: UdpSocket) -> None:
         self._sock = sock
         self._marks = np.full(_REMEMBERED, NO_ROW, np.int64)
         self._next = 0
-        self._found: list[tuple[I64, I64]] = []
+        self._counted_from_ns = 0
+        """POSIX UTC since which numbers are as they are: what is stamped before has a number of the count before."""
+        self._found: deque[tuple[I64, I64]] = deque()
+        self._unread = 0
 
     def sent(self, marks: I64, failed: Sequence[int]) -> None:
         """Datagrams were handed to the kernel, those of ``marks`` in this order."""
@@ -137,23 +145,31 @@ class Departures:
             self.collect()
             self._sock.restart_departures()
             self._marks[:], self._next = NO_ROW, 0
+            self._counted_from_ns = time.time_ns()
             return
         self._marks[(self._next + np.arange(len(marks))) % _REMEMBERED] = marks
         self._next = self._next + len(marks) & 0xFFFF_FFFF
 
     def collect(self) -> None:
         """Take what has come off the socket: while any stamps wait there, a selector finds it ready."""
-        if stamps := self._sock.departures():
-            found = np.array(stamps, np.int64)
-            marks = self._marks[found[:, 0] % _REMEMBERED]
-            known = marks != NO_ROW
-            self._found.append((marks[known], found[known, 1]))
+        stamps = self._sock.departures()
+        if not stamps:
+            return
+        found = np.array(stamps, np.int64)
+        marks, times = self._marks[found[:, 0] % _REMEMBERED], found[:, 1]
+        known = (marks != NO_ROW) & (times >= self._counted_from_ns)
+        if known.any():
+            self._found.append((marks[known], times[known]))
+            self._unread += int(known.sum())
+        while self._unread > _REMEMBERED:
+            self._unread -= len(self._found.popleft()[0])
 
     def read(self) -> tuple[I64, I64]:
         """(mark, POSIX UTC ns) of the stamps that have come since this was last asked."""
         self.collect()
         marks, times = zip((_NONE, _NONE), *self._found, strict=True)
         self._found.clear()
+        self._unread = 0
         return np.concatenate(marks), np.concatenate(times)
 
 
