@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools.flow import Segmentation
-from pmutools.net.audience import Addresses, Audience, Outbox, Sink, UdpSink
+from pmutools.net.audience import Audience, Sink
+from pmutools.net.outbox import Addresses, Outbox, UdpSink
 
 I64 = npt.NDArray[np.int64]
 

@@ -20,8 +20,9 @@ from pmutools.c37118.framer import Frame, Framer
 from pmutools.c37118.session import Outcome, Served, ServerRole
 from pmutools.errors import PmuError, SourceError
 from pmutools.flow import Hangup, Segmentation
-from pmutools.net.audience import Audience, Flushable, Outbox, Sink, UdpSink
+from pmutools.net.audience import Audience, Sink
 from pmutools.net.endpoint import Endpoint, Scheme, scoped
+from pmutools.net.outbox import Flushable, Outbox, UdpSink
 from pmutools.net.reactor import READ, WRITE, Reactor, Timer
 from pmutools.net.sockets import Address, explain, resolve
 from pmutools.net.tcp import CutOff, TcpListener, TcpPeer

@@ -25,9 +25,10 @@ from pmutools.c37118.session import Served
 from pmutools.clock import Clock
 from pmutools.errors import SettingsError
 from pmutools.flow import Hangup
-from pmutools.net.audience import Audience, Flushable, Outbox, UdpSink
+from pmutools.net.audience import Audience
 from pmutools.net.cargo import I64, Cargo, Frames, Table
 from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
+from pmutools.net.outbox import Flushable, Outbox, UdpSink
 from pmutools.net.outlet import ServerEvent, Stage, TcpOutlet, UdpOutlet
 from pmutools.net.reactor import Reactor
 from pmutools.net.sockets import Address, resolve

@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pmutools.net import audience as outbox
-from pmutools.net.audience import NO_ROW, Departures
+from pmutools.net import outbox
+from pmutools.net.outbox import NO_ROW, Departures
 from pmutools.net.udp import UdpSocket
 
 
