@@ -27,7 +27,6 @@ IP_ADD_SOURCE_MEMBERSHIP = 39
 IP_MULTICAST_ALL = 49
 MCAST_JOIN_SOURCE_GROUP = 46
 SO_TIMESTAMPING = 37
-IP_RECVERR = 11
 TX_SOFTWARE, SOFTWARE, OPT_ID, OPT_TSONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 """Flags of SO_TIMESTAMPING: stamp what is sent, report such stamps, number them, leave the datagram out."""
 MEMINFO_DROPS = 8

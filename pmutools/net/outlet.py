@@ -173,7 +173,7 @@ class Outlet:
     """A listening endpoint that offers ``streams``, by IDCODE; ``handles`` are their places in the audience."""
 
     def __init__(
-        self, index: int, endpoint: Endpoint, streams: Mapping[int, Served], handles: Mapping[int, int], stage: Stage
+        self, index: int, endpoint: Endpoint, streams: dict[int, Served], handles: Mapping[int, int], stage: Stage
     ) -> None:
         self.index = index
         self.endpoint = endpoint
@@ -247,7 +247,7 @@ class UdpOutlet(Outlet):
     """
 
     def __init__(
-        self, index: int, endpoint: Endpoint, streams: Mapping[int, Served], handles: Mapping[int, int], stage: Stage
+        self, index: int, endpoint: Endpoint, streams: dict[int, Served], handles: Mapping[int, int], stage: Stage
     ) -> None:
         super().__init__(index, endpoint, streams, handles, stage)
         self._sock = UdpSocket(endpoint.host, endpoint.port, batches=stage.batches, native=stage.native)
@@ -334,7 +334,7 @@ class TcpOutlet(Outlet):
         self,
         index: int,
         endpoint: Endpoint,
-        streams: Mapping[int, Served],
+        streams: dict[int, Served],
         handles: Mapping[int, int],
         stage: Stage,
         queue_bytes: int,
@@ -351,12 +351,8 @@ class TcpOutlet(Outlet):
 
     def close(self) -> None:
         self._close_listener()
-        self.disconnect()
-
-    def disconnect(self, *, reset: bool = False) -> None:
-        """Send all clients away, with FIN or RST."""
         for client in list(self._clients):
-            self._drop(client, ServerKind.DISCONNECTED, "by this side", reset=reset)
+            self._drop(client, ServerKind.DISCONNECTED, "by this side")
 
     def hang_up(self, idcode: int, how: Hangup) -> int:
         """Send away whoever has started the stream; returns how many.

@@ -79,13 +79,13 @@ class Senders:
         self._stamp_departures = stamp_departures
         self._queue_bytes = queue_bytes
         self._batches = Batches() if native else None
-        self.reactor = self._reactor = Reactor(clock)
+        self.reactor = Reactor(clock)
         self._audience = Audience()
         self._events: list[ServerEvent] = []
         self._interrupted = False
         self._dirty: dict[Flushable, None] = {}
         self._stage = Stage(
-            self._reactor,
+            self.reactor,
             self._audience,
             self._events.append,
             self._dirty,
@@ -96,7 +96,8 @@ class Senders:
             treat,
         )
         self._served: list[Served] = []
-        self._outlets: list[tuple[dict[int, Served], TcpOutlet | UdpOutlet | None]] = []
+        self._outlets: list[TcpOutlet | UdpOutlet | None] = []
+        """By number; None for those that only send."""
         self._boxes: dict[tuple[str, str | None, int | None], Outbox] = {}
         self._spontaneous: list[list[UdpSink]] = []
         self._table: Table | None = None
@@ -106,7 +107,7 @@ class Senders:
             self._share_ns = max(cfg_period_ns // _SHARES, 1)
             self._share_due_ns = clock.monotonic_ns()
             self._await_share()
-        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
+        self.reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
 
     def __enter__(self) -> Senders:
         return self
@@ -131,9 +132,9 @@ class Senders:
         if stream.idcode != self._served[handle].idcode:
             raise ValueError(f"stream {handle} is {self._served[handle].idcode}, not {stream.idcode}")
         before, self._served[handle] = self._served[handle], stream
-        for streams, _ in self._outlets:
-            if streams.get(stream.idcode) is before:
-                streams[stream.idcode] = stream
+        for outlet in self._outlets:
+            if outlet is not None and outlet.streams.get(stream.idcode) is before:
+                outlet.streams[stream.idcode] = stream
 
     def send_to(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
         """Send streams to a UDP address without being asked; returns the outlet's number.
@@ -155,7 +156,7 @@ class Senders:
             sink = UdpSink(box, where)
             self._audience.add(handle, sink)
             self._spontaneous[handle].append(sink)
-        self._outlets.append(({}, None))
+        self._outlets.append(None)
         return len(self._outlets) - 1
 
     def listen(self, endpoint: Endpoint, streams: Sequence[int]) -> int:
@@ -179,12 +180,12 @@ class Senders:
             outlet = UdpOutlet(number, endpoint, offered, handles, self._stage)
         else:
             outlet = TcpOutlet(number, endpoint, offered, handles, self._stage, self._queue_bytes)
-        self._outlets.append((offered, outlet))
+        self._outlets.append(outlet)
         return number
 
     def local(self, outlet: int) -> Address | None:
         """Where an outlet listens; None for one that only sends."""
-        listening = self._outlets[outlet][1]
+        listening = self._outlets[outlet]
         return listening.address if listening is not None else None
 
     def audience(self, stream: int) -> int:
@@ -194,7 +195,7 @@ class Senders:
     @property
     def queued_bytes(self) -> int:
         """What waits for TCP clients that are slow to take it."""
-        return sum(outlet.queued_bytes for _, outlet in self._outlets if outlet is not None)
+        return sum(outlet.queued_bytes for outlet in self._outlets if outlet is not None)
 
     # --- running
 
@@ -232,7 +233,7 @@ class Senders:
 
     def departures(self) -> tuple[I64, I64]:
         """(mark, POSIX UTC ns) of frames whose departure the kernel has stamped since this was last asked."""
-        outboxes = [outlet.outbox for _, outlet in self._outlets if isinstance(outlet, UdpOutlet)]
+        outboxes = [outlet.outbox for outlet in self._outlets if isinstance(outlet, UdpOutlet)]
         found = [box.departures.read() for box in (*self._boxes.values(), *outboxes) if box.departures is not None]
         marks, times = zip(*found, strict=True) if found else ((), ())
         return np.concatenate([_NONE, *marks]), np.concatenate([_NONE, *times])
@@ -257,7 +258,7 @@ class Senders:
 
     def poll(self, timeout_ns: int | None) -> list[ServerEvent]:
         """Answer clients and repeat configurations; waits for something to do at most ``timeout_ns``."""
-        self._reactor.run(0 if self._events else timeout_ns, HANDLING_NS)
+        self.reactor.run(0 if self._events else timeout_ns, HANDLING_NS)
         self._last_poll_ns = self._clock.monotonic_ns()
         events = self._events[:]
         self._events.clear()
@@ -282,12 +283,6 @@ class Senders:
         """Have :meth:`serve_until` return as soon as what is being answered is: for those who are called meanwhile."""
         self._interrupted = True
 
-    def disconnect(self, outlet: int, *, reset: bool = False) -> None:
-        """Send all TCP clients of an outlet away, with FIN or with RST; they may come back."""
-        listening = self._outlets[outlet][1]
-        if isinstance(listening, TcpOutlet):
-            listening.disconnect(reset=reset)
-
     def hang_up(self, stream: int, how: Hangup) -> int:
         """Let TCP clients that have started a stream feel that it falls silent; returns how many were sent away.
 
@@ -311,21 +306,21 @@ class Senders:
         """The outlets with connections that offer a stream, and its IDCODE there."""
         return [
             (outlet, idcode)
-            for _, outlet in self._outlets
+            for outlet in self._outlets
             if isinstance(outlet, TcpOutlet)
             for idcode, handle in outlet.handles.items()
             if handle == stream
         ]
 
     def close(self) -> None:
-        for _, outlet in self._outlets:
+        for outlet in self._outlets:
             if outlet is not None:
                 outlet.close()
         for box in self._boxes.values():
             box.sock.close()
         self._outlets.clear()
         self._boxes.clear()
-        self._reactor.close()
+        self.reactor.close()
 
     # --- inside
 
@@ -351,7 +346,7 @@ class Senders:
         """The next portion is due a fixed time after the one before was; after a long stall, from now."""
         behind = self._clock.monotonic_ns() - self._share_due_ns > _SHARES * self._share_ns
         self._share_due_ns = (self._clock.monotonic_ns() if behind else self._share_due_ns) + self._share_ns
-        self._reactor.call_at(self._share_due_ns, self._announce_share)
+        self.reactor.call_at(self._share_due_ns, self._announce_share)
 
     def _announce_share(self) -> None:
         self.announce(range(self._share, len(self._served), _SHARES))
@@ -360,7 +355,7 @@ class Senders:
 
     def _keep_house(self) -> None:
         now_ns = self._clock.monotonic_ns()
-        for _, outlet in self._outlets:
+        for outlet in self._outlets:
             if outlet is not None:
                 outlet.keep_house(now_ns)
-        self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
+        self.reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
