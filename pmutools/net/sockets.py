@@ -57,6 +57,26 @@ def resolve(host: str, port: int, *, datagram: bool, family: int = socket.AF_UNS
     return Address(numeric, (str(sockaddr[0]), *sockaddr[1:]))
 
 
+def listening_socket(address: Address, backlog: int, called: str) -> socket.socket:
+    """A non-blocking TCP socket that listens, IPv6 without IPv4.
+
+    Raises SourceError, which begins with ``called``, where the port is taken or not permitted.
+    """
+    sock = socket.socket(address.family, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        if address.family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        if sys.platform != "win32":  # a new start need not wait for old connections; on Windows it means sharing
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(address.sockaddr)
+        sock.listen(backlog)
+    except OSError as error:
+        sock.close()
+        raise explain(error, called) from None
+    return sock
+
+
 _REMEDIES = {
     errno.EADDRINUSE: "already in use; stop the other program that has this port, or choose another",
     errno.EADDRNOTAVAIL: "this machine does not have that address; use 0.0.0.0 for every local address",

@@ -12,14 +12,13 @@ import errno
 import os
 import socket
 import struct
-import sys
 import time
 from collections import deque
 from typing import NamedTuple
 
 from pmutools import linux
 from pmutools.flow import Chunk, Cut, Flow, Segmentation, StampSource
-from pmutools.net.sockets import Address, explain, resolve, stamp_arrivals
+from pmutools.net.sockets import Address, explain, listening_socket, resolve, stamp_arrivals
 
 READ_BYTES = 256 << 10
 QUEUE_BYTES = 256 << 10
@@ -121,19 +120,8 @@ class TcpListener:
 
     def __init__(self, host: str, port: int) -> None:
         wanted = resolve(host, port, datagram=False)
-        self._sock = sock = socket.socket(wanted.family, socket.SOCK_STREAM)
-        try:
-            sock.setblocking(False)
-            if wanted.family == socket.AF_INET6:
-                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            if sys.platform != "win32":  # a new start need not wait for old connections; on Windows it means sharing
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            sock.bind(wanted.sockaddr)
-            sock.listen(_BACKLOG)
-        except OSError as error:
-            sock.close()
-            raise explain(error, f"tcp://{wanted}") from None
-        self.address = Address(wanted.family, sock.getsockname())
+        self._sock = listening_socket(wanted, _BACKLOG, f"tcp://{wanted}")
+        self.address = Address(wanted.family, self._sock.getsockname())
 
     def fileno(self) -> int:
         return self._sock.fileno()

@@ -16,7 +16,7 @@ from pmutools.c37118.framer import Frame, Framer, Skipped
 from pmutools.errors import SourceError
 from pmutools.flow import Chunk, Cut, Segmentation, StampSource
 from pmutools.net import tcp
-from pmutools.net.sockets import Address
+from pmutools.net.sockets import Address, listening_socket, resolve
 from pmutools.net.tcp import CutOff, TcpClient, TcpListener, TcpPeer
 
 if TYPE_CHECKING:
@@ -231,6 +231,13 @@ def test_a_port_in_use_is_told_with_a_remedy() -> None:
     with pytest.raises(SourceError, match="does not have that address"):
         TcpListener("192.0.2.123", 0)
     listener.close()
+
+
+def test_ipv6_and_ipv4_listen_on_one_port_and_who_cannot_is_told_by_its_name() -> None:
+    with listening_socket(resolve("::", 0, datagram=False), 1, "six") as six:
+        four = resolve("0.0.0.0", six.getsockname()[1], datagram=False)
+        with listening_socket(four, 1, "four"), pytest.raises(SourceError, match=r"^another: already in use"):
+            listening_socket(four, 1, "another")
 
 
 def test_a_local_address_that_is_none_is_told() -> None:

@@ -17,7 +17,7 @@ from contextlib import suppress
 
 from pmutools.errors import SettingsError, SourceError
 from pmutools.net.reactor import READ, WRITE, Reactor, Timer
-from pmutools.net.sockets import Address, explain, resolve
+from pmutools.net.sockets import Address, explain, listening_socket, resolve
 from pmutools.timebase import NS
 from pmutools.tools.player.control import Controlled, ControlSession
 from pmutools.tools.player.control_address import ControlAddress
@@ -281,20 +281,7 @@ class _Client:
 
 
 def _listen_tcp(address: ControlAddress) -> socket.socket:
-    wanted = resolve(address.host, address.port, datagram=False)
-    sock = socket.socket(wanted.family, socket.SOCK_STREAM)
-    try:
-        sock.setblocking(False)
-        if wanted.family == socket.AF_INET6:
-            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        if os.name == "posix":  # elsewhere it means sharing the port
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(wanted.sockaddr)
-        sock.listen(_BACKLOG)
-    except OSError as error:
-        sock.close()
-        raise explain(error, f"--control {address}") from None
-    return sock
+    return listening_socket(resolve(address.host, address.port, datagram=False), _BACKLOG, f"--control {address}")
 
 
 def _listen_unix(address: ControlAddress) -> socket.socket:
