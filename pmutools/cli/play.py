@@ -15,12 +15,13 @@ from pmutools import linux, parsers
 from pmutools.cli.shell import Exit, F, Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION, END, START, Watched, spare
 from pmutools.errors import SettingsError
-from pmutools.timebase import NS, parse_utc
+from pmutools.timebase import NS, format_utc, parse_utc
 
 if TYPE_CHECKING:
     from pmutools.cli.play_display import Display
     from pmutools.impair.profile import Profile
     from pmutools.net.endpoint import Endpoint
+    from pmutools.net.outlet import ServerEvent
     from pmutools.tools.player.cast import Spread
     from pmutools.tools.player.material import Choice
     from pmutools.tools.player.play import Options, Player
@@ -68,9 +69,9 @@ def _pair(text: str) -> tuple[str, str]:
     return old.strip(), new.strip()
 
 
-def _idcodes(text: str) -> tuple[int, int]:
+def _idcodes(text: str) -> tuple[int | str, int]:
     old, new = _pair(text)
-    return parsers.integer(0, 0xFFFF)(old), parsers.integer(1, 65534)(new)
+    return parsers.integer(0, 0xFFFF)(old) if old.isdecimal() else old, parsers.integer(1, 65534)(new)
 
 
 def _form(text: str) -> Form:
@@ -103,7 +104,14 @@ def _spread(text: str) -> Spread:
     metavar="S",
     help="Cut silences longer than S seconds down to S (whole seconds are left out).",
 )
-@click.option("--idcode", "idcodes", type=Parsed(_idcodes), multiple=True, metavar="OLD=NEW", help="Renumber a stream.")
+@click.option(
+    "--idcode",
+    "idcodes",
+    type=Parsed(_idcodes),
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Renumber a stream; OLD may be its name.",
+)
 @click.option("--station", "stations", type=Parsed(_pair), multiple=True, metavar="OLD=NEW", help="Rename a station.")
 @click.option("--format", "form", type=Parsed(_form), metavar="WORDS", help="Another FORMAT: polar,int or rect,float.")
 @click.option(
@@ -162,6 +170,8 @@ def command(
     With --listen alone, playing begins at the first start command. --duration ends it S seconds after it began to
     listen or send. At the end each stream's pacing error is told: that is the player's accuracy.
     """
+    from pmutools.c37118.session import Outcome
+    from pmutools.cli.herald import Herald
     from pmutools.clock import SystemClock
     from pmutools.impair.profile import parse_action
     from pmutools.net.endpoint import parse_endpoint
@@ -178,6 +188,8 @@ def command(
     address = parse_control_address(control) if control else None
     if interactive:
         _require_terminal()
+    if said["begin_utc_ns"] is not None and said["begin_utc_ns"] < SystemClock().realtime_ns():
+        raise SettingsError(f"--at {format_utc(said['begin_utc_ns'])} is past; give a time to come")
     options, choice = _options(*endpoints, said), _choice(said)
     if ledger is not None:
         spare(ledger, choice.files)
@@ -193,18 +205,20 @@ def command(
 
     native = linux.NATIVE and not portable
     display: Display | None = None
+    herald = Herald(talk)
 
     def tell(text: str) -> None:
-        if display is not None:
-            display.note(text)
-        else:
-            talk.say(text)
+        (herald.say if display is None else display.note)(text)
+
+    def hear(event: ServerEvent) -> None:
+        if display is not None or verbose or event.kind is not Outcome.ANSWERED:
+            tell(f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip())
 
     def progress() -> None:
         if display is None:
             from pmutools.cli.status_text import progress_line
 
-            talk.progress(progress_line(player.status()))
+            herald.progress(progress_line(player.status()))
 
     with interruptible() as asked, ExitStack() as stack:
         player = stack.enter_context(
@@ -213,7 +227,7 @@ def command(
                 options,
                 SystemClock(spin_ns=0 if fifo else SPIN_NS, native=native),
                 stop=lambda: asked() or (display is not None and display.quit),
-                tell=lambda event: tell(_event(event)),
+                tell=hear,
                 warn=tell,
                 stamp_departures=ledger is not None,
                 native=native,
@@ -278,13 +292,15 @@ def _choice(said: dict[str, Any]) -> Choice:
     start: Moment | None = said["start"]
     same = ("timing", "select", "exclude", "form", "pdc_idcode", "skip_gaps_ns", "interval_ns", "emulate", "spread")
     plant = _plant(said)
+    idcodes = _each_once("--idcode", said["idcodes"])
     return Choice(
         files=said["files"],
         plant=plant,
         data_rate=said["data_rate"],
         fnom_hz=float(said["nominal"]) if said["nominal"] else None,
         window=Window(start, said["end"]),
-        idcodes=_each_once("--idcode", said["idcodes"]),
+        idcodes={old: new for old, new in idcodes.items() if isinstance(old, int)},
+        names={old: new for old, new in idcodes.items() if isinstance(old, str)},
         stations=_each_once("--station", said["stations"]),
         fps=None if plant is not None else said["fps"],
         stagger=not said["together"],
@@ -345,10 +361,6 @@ def _listening(endpoint: Endpoint) -> Endpoint:
     if not endpoint.scheme.commanded:
         raise SettingsError(f"--listen {endpoint}: udp:// knows no commands; give --to, or udp+cmd://")
     return endpoint
-
-
-def _event(event: Any) -> str:
-    return f"{event.client} {event.kind} {event.idcode or ''} {event.detail}".rstrip()
 
 
 def _tell_results(results: Results, talk: Talk, *, all_of_them: bool) -> None:

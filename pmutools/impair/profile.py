@@ -244,7 +244,11 @@ def _with_files(text: str, read: ReadText | None) -> str:
     def numbers(match: re.Match[str]) -> str:
         if read is None:
             raise ValueError(f"@{match[1]}: no file can be named here")
-        lines = (line.partition("#")[0] for line in read(match[1]).splitlines())
+        try:
+            text = read(match[1])
+        except SourceError as error:
+            raise ValueError(str(error)) from None
+        lines = (line.partition("#")[0] for line in text.splitlines())
         return ",".join(number for line in lines for number in line.replace(",", " ").split())
 
     return _FILE.sub(numbers, text)

@@ -7,7 +7,7 @@ track did, as no two devices send in the same microsecond. With a spread, its va
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import NamedTuple
@@ -201,9 +201,16 @@ class Cast:
         return fresh.tobytes()
 
 
-def as_recorded(reel: Reel) -> Cast:
-    """Each track as itself."""
-    parts = [Part(number, track.name, track.config.idcode) for number, track in enumerate(reel.tracks)]
+def as_recorded(reel: Reel, idcodes: Mapping[str, int] | None = None) -> Cast:
+    """Each track as itself, or by its name under another IDCODE; raises SettingsError for a name that is none."""
+    new = dict(idcodes or {})
+    parts = [
+        Part(number, track.name, new.get(track.name, track.config.idcode), emulated=track.name in new)
+        for number, track in enumerate(reel.tracks)
+    ]
+    for name in new.keys() - {part.name for part in parts}:
+        there = ", ".join(part.name for part in parts)
+        raise SettingsError(f"--idcode {name}={new[name]}: no such stream; there are {there}")
     return Cast(reel, parts)
 
 

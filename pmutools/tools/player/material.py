@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pmutools.c37118.demux import Loss, Message
@@ -31,6 +31,8 @@ class Choice:
     select: Sequence[str] = ()
     exclude: Sequence[str] = ()
     idcodes: Mapping[int, int] = field(default_factory=dict)
+    names: Mapping[str, int] = field(default_factory=dict)
+    """New IDCODEs by the streams' names: those that share one can be told apart so."""
     stations: Mapping[str, str] = field(default_factory=dict)
     form: Form | None = None
     pdc_idcode: int | None = None
@@ -62,12 +64,15 @@ def material(choice: Choice, watched: Callable[[Source], Source] = lambda source
         read[:] = [source]
         return source.blocks()
 
-    reel = record(_recast(choice, opened, changes), choice.timing, choice.window, choice.select, choice.exclude)
+    chosen = (choice.select, choice.exclude) if choice.pdc_idcode is None else ((), ())
+    reel = record(_recast(choice, opened, changes), choice.timing, choice.window, *chosen)
     reel, notes = _timed(choice, reel)
     if choice.emulate is None:
         if choice.spread is not None:
             raise SettingsError("--spread makes emulated PMUs differ; give --emulate N too")
-        cast = as_recorded(reel)
+        cast = as_recorded(reel, choice.names)
+    elif choice.names:
+        raise SettingsError("--idcode by name and --emulate clash: emulated PMUs have IDCODEs of their own")
     else:
         cast = emulated(reel, choice.emulate, choice.seed, stagger=choice.stagger, spread=choice.spread)
     return Material(cast, losses(read[0]), [*described(changes), *notes])
@@ -88,12 +93,32 @@ def _recast(choice: Choice, opened: Callable[[], Items], changes: Changes) -> It
             items = renamed(items, choice.stations, changes)
         if choice.idcodes:
             items = renumbered(items, choice.idcodes, changes)
-        return items if choice.form is None else reformatted(items, choice.form, changes)
+        if choice.form is not None:
+            items = reformatted(items, choice.form, changes)
+        if choice.pdc_idcode is not None and (choice.select or choice.exclude):
+            items = _members(items, choice.select, choice.exclude)
+        return items
 
     if choice.pdc_idcode is None:
         return items(changes)
     passes = iter((None, changes))  # it is read twice, and told of once
     return concentrated(lambda: items(next(passes)), choice.pdc_idcode, changes=changes)
+
+
+def _members(items: Items, select: Collection[str], exclude: Collection[str]) -> Iterator[Block | Message | Loss]:
+    """The streams of a concentrator-to-be, by IDCODE or station; raises SettingsError for a name that fits none."""
+    missing = {*select, *exclude}
+    for item in items:
+        config = item.batch.config if isinstance(item, Block) else getattr(item, "config", None)
+        if config is None:
+            yield item
+            continue
+        names = {str(config.idcode), *(station.name for station in config.stations)}
+        missing -= names
+        if (not select or names & {*select}) and not names & {*exclude}:
+            yield item
+    if missing:
+        raise SettingsError(f"--select or --exclude {min(missing)}: no stream has this IDCODE or station")
 
 
 def _timed(choice: Choice, reel: Reel) -> tuple[Reel, list[str]]:

@@ -112,9 +112,9 @@ class Player:
         try:
             self.handles = [self.senders.add(_offer(cast, part, int(e))) for part, e in enumerate(cast.editions)]
             for endpoint in options.to:
-                self.senders.send_to(endpoint, self._picked(endpoint))
+                self.senders.send_to(endpoint, self._told_apart(f"--to {endpoint}", self._picked(endpoint)))
             for endpoint in options.listen:
-                self.senders.listen(endpoint, self._told_apart(endpoint, self._picked(endpoint)))
+                self.senders.listen(endpoint, self._told_apart(f"--listen {endpoint}", self._picked(endpoint)))
         except BaseException:
             self.senders.close()
             raise
@@ -128,14 +128,16 @@ class Player:
             raise SettingsError(f"{endpoint}: no stream of IDCODE {endpoint.idcode}; there are {there}")
         return chosen
 
-    def _told_apart(self, endpoint: Endpoint, handles: list[int]) -> list[int]:
-        """``handles``, if commands can tell their streams apart."""
+    def _told_apart(self, where: str, handles: list[int]) -> list[int]:
+        """``handles``, if their streams can be told apart there."""
         names: dict[int, str] = {}
         for handle in handles:
             part = self.cast.parts[handle]
             if (other := names.setdefault(part.idcode, part.name)) != part.name:
                 both = f"{other} and {part.name} both have IDCODE {part.idcode}"
-                raise SettingsError(f"--listen {endpoint}: {both}; choose one with --select or --exclude")
+                raise SettingsError(
+                    f"{where}: {both}; choose one with --select, or renumber it: --idcode '{part.name}=N'"
+                )
         return handles
 
     # --- playing
