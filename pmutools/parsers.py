@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from decimal import Decimal, InvalidOperation
 from difflib import get_close_matches
 from typing import Any, NamedTuple, TypeVar
 
-from pmutools.timebase import NS
+from pmutools.timebase import NS, parse_utc
 
 T = TypeVar("T")
 Parser = Callable[[str], T]
@@ -27,6 +27,16 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     words = list(known)
     close = [known_ for known_ in words if known_.startswith(f"{word} ")] or get_close_matches(word, words, 1)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(words) or 'none'}"
+
+
+NAMED_STREAMS = 20
+"""More streams than these are not listed in a sentence."""
+
+
+def no_such_stream(asked: object, there: Sequence[str]) -> str:
+    """That what was asked for concerns no stream, and which there are."""
+    names = ", ".join(there[:NAMED_STREAMS]) + (" ..." if len(there) > NAMED_STREAMS else "")
+    return f"{asked}: no such stream; there are {names}"
 
 
 def unique(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
@@ -128,6 +138,31 @@ def duration_ns(unit_ns: int, low: float = 0.0) -> Parser[int]:
 
 seconds_ns = duration_ns(NS)
 milliseconds_ns = duration_ns(NS // 1000)
+
+
+class Place(NamedTuple):
+    """A time in a recording: ns into it (``relative``), or POSIX UTC.
+
+    A window counts from the first stamp, the player from when its first frame is due.
+    """
+
+    ns: int
+    relative: bool
+
+
+def parse_place(text: str, low: float = -math.inf) -> Place:
+    """``12.5`` (seconds into the recording, not below ``low``) or an ISO-8601 UTC time such as 2016-09-08T17:05:11Z."""
+    try:
+        if Decimal(text.strip()).is_finite():
+            return Place(duration_ns(NS, low)(text), relative=True)
+    except InvalidOperation:
+        pass
+    try:
+        return Place(parse_utc(text), relative=False)
+    except ValueError:
+        raise ValueError(
+            f"{text!r} is no time; write seconds into the source (12.5) or UTC (2016-09-08T17:05:11Z)"
+        ) from None
 
 
 def words(text: str) -> tuple[str, ...]:

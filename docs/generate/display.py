@@ -12,11 +12,11 @@ import re
 from pathlib import Path
 
 from rich._export_format import CONSOLE_SVG_FORMAT
-from rich.console import Console
+from rich.console import Console, Group
 from rich.terminal_theme import MONOKAI
 
 from pmutools.cli.play_keys import Ui
-from pmutools.cli.play_screen import Title, render
+from pmutools.cli.play_screen import Title, lines
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState, StreamStatus
 
 PICTURE = Path(__file__).parents[1] / "img" / "player.svg"
@@ -59,7 +59,7 @@ def ui() -> Ui:
 def svg() -> str:
     """The picture, with the reader's own fonts: a page that is read offline can fetch none."""
     console = Console(file=io.StringIO(), record=True, width=SIZE[0], height=SIZE[1], force_terminal=True)
-    console.print(render(state(), ui(), TITLE, *SIZE, 1.0), end="")
+    console.print(Group(*lines(state(), ui(), TITLE, *SIZE, 1.0)), end="")
     own = re.sub(r"@font-face \{\{.*?\}\}\n", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL)
     own = own.replace("font-family: Fira Code, monospace", "font-family: monospace")
     return console.export_svg(title="pmu play --interactive", theme=MONOKAI, code_format=own, unique_id="player")

@@ -11,7 +11,7 @@ from pmutools.cli.shell import Exit, Talk, common
 from pmutools.cli.sources import DURATION, END, IDCODES, START, Watched, spare
 
 if TYPE_CHECKING:
-    from pmutools.tools.window import Moment
+    from pmutools.parsers import Place
 
 
 @click.command(name="convert", short_help="Recordings to another format.")
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 def command(
     inputs: tuple[str, ...],
     output: str,
-    start: Moment | None,
-    end: Moment | None,
+    start: Place | None,
+    end: Place | None,
     idcodes: tuple[int, ...],
     phasors: str,
     long_form: bool,

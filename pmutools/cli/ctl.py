@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from pmutools.tools.player.control_client import ControlClient
 
 
+def _every_s(text: str) -> float:
+    from pmutools.tools.player.control import EVERY_S
+
+    return parsers.number(*EVERY_S)(text)
+
+
 @click.command(
     name="ctl", short_help="Control a running player.", context_settings={"ignore_unknown_options": True}
 )  # a time may begin with a minus
@@ -24,7 +30,7 @@ if TYPE_CHECKING:
 @click.option(
     "--watch",
     "every_s",
-    type=Parsed(parsers.number(0.1, 3600)),
+    type=Parsed(_every_s),
     metavar="S",
     help="With stats: again every S seconds, until the player ends.",
 )
@@ -34,8 +40,8 @@ def command(
 ) -> int:
     """Control a player that was started with --control TARGET, a path or HOST:PORT.
 
-    VERB is pause, resume, step [N], seek T, speed X, loop A B, loop off, enable NAME, disable NAME, fault NAME
-    OPTION=VALUE, or stats. Silent when done; --json prints the player's answer.
+    VERB is pause, resume, step, seek, speed, loop, enable, disable, fault or stats; the verb help tells what follows
+    each. Silent when done; --json prints the player's answer.
     """
     from pmutools.tools.player.control import parse_control
     from pmutools.tools.player.control_address import parse_control_address
@@ -89,6 +95,6 @@ def _show(result: object, as_json: bool) -> None:
         click.echo(json.dumps(result))
         return
     from pmutools.cli.status_text import status_lines
-    from pmutools.tools.player.control_client import status_of
+    from pmutools.tools.player.status import PlayerStatus
 
-    click.echo("\n".join(status_lines(status_of(result), shutil.get_terminal_size().columns)))
+    click.echo("\n".join(status_lines(PlayerStatus.from_json(result), shutil.get_terminal_size().columns)))

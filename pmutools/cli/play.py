@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from pmutools.impair.profile import Profile
     from pmutools.net.endpoint import Endpoint
     from pmutools.net.outlet import ServerEvent
+    from pmutools.pacing import LatenessSummary
     from pmutools.tools.player.cast import Spread
     from pmutools.tools.player.material import Choice
     from pmutools.tools.player.play import Options, Player
     from pmutools.tools.player.results import Results
     from pmutools.tools.recast import Form
     from pmutools.tools.synth import Recipe
-    from pmutools.tools.window import Moment
 
 MS = 1_000_000
 FAULTS = {
@@ -56,10 +56,9 @@ def _faults(function: F) -> F:
 
 
 def _speed(text: str) -> Fraction:
-    from pmutools.impair.verbs import SPEED_DENOMINATOR
+    from pmutools.impair.verbs import speed
 
-    parsers.number(0.001, 1000)(text)
-    return Fraction(text.strip()).limit_denominator(SPEED_DENOMINATOR)
+    return speed(text)
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -200,8 +199,7 @@ def command(
     for note in stuff.notes:
         talk.say(note)
     for pattern in options.profile.unmatched(map(cast.names, range(len(cast.parts)))):
-        names = ", ".join(part.name for part in cast.parts[:TOLD_STREAMS])
-        talk.say(f"no stream is called {pattern!r}; there are {names}")
+        talk.say(parsers.no_such_stream(pattern, [part.name for part in cast.parts]))
 
     native = linux.NATIVE and not portable
     display: Display | None = None
@@ -289,7 +287,7 @@ def _choice(said: dict[str, Any]) -> Choice:
     from pmutools.tools.player.material import Choice
     from pmutools.tools.window import Window
 
-    start: Moment | None = said["start"]
+    start: parsers.Place | None = said["start"]
     same = ("timing", "select", "exclude", "form", "pdc_idcode", "skip_gaps_ns", "interval_ns", "emulate", "spread")
     plant = _plant(said)
     idcodes = _each_once("--idcode", said["idcodes"])
@@ -374,10 +372,13 @@ def _tell_results(results: Results, talk: Talk, *, all_of_them: bool) -> None:
         talk.say(f"  {result.name:<16} {_told(result.fates, result.late)}")
 
 
-def _told(fates: dict[str, int], late: Any) -> str:
+def _told(fates: dict[str, int], late: LatenessSummary) -> str:
+    from pmutools.tools.player.status import PacingStatus
+
+    pacing = PacingStatus.of(late)
     text = ", ".join(f"{count} {fate}" for fate, count in fates.items()) or "nothing due"
-    p50, p99, most = (f"{ns / 1000:.0f} us" for ns in (late.p50_ns, late.p99_ns, late.max_ns))
-    return f"{text}; late p50 {p50}, p99 {p99}, max {most}, {late.misses} misses"
+    p50, p99, most = (f"{us:.0f} us" for us in (pacing.p50_us, pacing.p99_us, pacing.max_us))
+    return f"{text}; late p50 {p50}, p99 {p99}, max {most}, {pacing.misses} misses"
 
 
 def _profile(impair: str | None, faults: dict[str, tuple[str, ...]]) -> Profile:

@@ -12,7 +12,8 @@ from glob import escape
 from typing import NamedTuple
 
 from pmutools.impair.profile import Action
-from pmutools.impair.verbs import Place
+from pmutools.impair.verbs import SPEEDS
+from pmutools.parsers import Place
 from pmutools.timebase import NS
 from pmutools.tools.player.control import BY_NAME, parse_control
 from pmutools.tools.player.status import PlayerStatus, PlayState, StreamStatus
@@ -21,7 +22,6 @@ EVENTS = 40
 """Events kept for the screen."""
 PROMPT_CHARACTERS = 1000
 FASTER = 1.1
-SPEEDS = (0.001, 1000.0)
 
 
 # --- what the screen shows beside the player's state -------------------------------------------------------------

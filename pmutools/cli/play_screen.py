@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from rich.cells import cell_len
-from rich.console import Group
 from rich.style import Style
 from rich.text import Text
 
@@ -52,15 +51,13 @@ def page_rows(height: int) -> int:
     return max(1, height - HEAD - FOOT - (1 if height < 30 else 3))
 
 
-def render(status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None = None) -> Group:
-    """The screen: exactly ``height`` lines, none wider than ``width``. ``reached`` is the speed that was measured."""
-    return Group(*lines(status, ui, title, width, height, reached))
-
-
 def lines(
     status: PlayerStatus, ui: Ui, title: Title, width: int, height: int, reached: float | None = None
 ) -> Iterator[Text]:
-    """The lines of :func:`render`, each made when it is asked for."""
+    """The screen: exactly ``height`` lines, none wider than ``width``, each made when it is asked for.
+
+    ``reached`` is the speed that was measured.
+    """
     if width < SMALLEST[0] or height < SMALLEST[1]:
         drawn = iter([Text("too small: {}x{} needed".format(*SMALLEST))])
     elif ui.help:

@@ -17,18 +17,11 @@ from pmutools.timebase import NS
 if TYPE_CHECKING:
     from pmutools.c37118.demux import Loss, Message
     from pmutools.formats.source import Block, Source
-    from pmutools.tools.window import Moment
 
 T = TypeVar("T")
 TOLD_FRAMES = 10_000
 TARGET = str
 """A path, or an endpoint URL."""
-
-
-def _moment(text: str) -> Moment:
-    from pmutools.tools.window import parse_moment
-
-    return parse_moment(text)
 
 
 IDCODES = click.option(
@@ -40,9 +33,9 @@ IDCODES = click.option(
     help="Only this stream; repeatable.",
 )
 START = click.option(
-    "--start", type=Parsed(_moment), metavar="T", help="From T: seconds into the source, or ISO-8601 UTC."
+    "--start", type=Parsed(parsers.parse_place), metavar="T", help="From T: seconds into the source, or ISO-8601 UTC."
 )
-END = click.option("--end", type=Parsed(_moment), metavar="T", help="Up to T, exclusive.")
+END = click.option("--end", type=Parsed(parsers.parse_place), metavar="T", help="Up to T, exclusive.")
 DURATION = click.option(
     "--duration",
     "duration_ns",

@@ -17,7 +17,7 @@ from pmutools.impair.profile import (
 )
 from pmutools.impair.profiles import READY, load_profile, ready_profile
 from pmutools.impair.stages import OPTIONS
-from pmutools.impair.verbs import Place
+from pmutools.parsers import Place
 
 __all__ = [
     "OPTIONS",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 from pmutools.c37118.config import AnalogChannel, Station, StreamConfig, as_kind, encode_config
@@ -26,6 +27,8 @@ from pmutools.impair.wire_faults import refitted
 from pmutools.parsers import boolean, choice, integer, one_of, parsed_by, seconds_ns, suggestion
 
 _MOST_ANALOGS = 1000
+KEPT = 64
+"""Combinations of parts whose configuration is kept, a stream: parts with chances meet in any of 2^parts."""
 
 
 class Kind(Protocol):
@@ -164,7 +167,7 @@ class Reconfiguration:
     ) -> None:
         self._config = config
         self._parts = [self._at(part, name, draws) for name, part in named_parts("config", parts)]
-        self._known: dict[tuple[bool, ...], _Changed] = {}
+        self._changed = lru_cache(KEPT)(self._change)
         if parts:
             for one in range(len(parts)):
                 self._changed(tuple(number == one for number in range(len(parts))))
@@ -221,11 +224,6 @@ class Reconfiguration:
             return frame
         stamp = {"soc": prefix.soc, "fracsec": prefix.fracsec, "time_quality": prefix.time_quality}
         return encode_config(as_kind(config, FrameType(prefix.type)), **stamp)
-
-    def _changed(self, active: tuple[bool, ...]) -> _Changed:
-        if active not in self._known:
-            self._known[active] = self._change(active)
-        return self._known[active]
 
     def _change(self, active: tuple[bool, ...]) -> _Changed:
         own = config = self._config

@@ -8,13 +8,14 @@ Bytes change above UDP and TCP, whose own checksums stay right: the receiver's C
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from pmutools.c37118.checksum import sealed
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import CHK_SIZE, MIN_FRAME_SIZE, FrameType
 from pmutools.draws import Draws
 from pmutools.impair.blocks import chance
+from pmutools.impair.grammar import Chanced, with_probability
 from pmutools.impair.moment import Moment, Test
 from pmutools.impair.scope import FIELDS, STATION_FIELDS, WHOLE, Scope, Span, byte_span
 from pmutools.impair.selectors import DATA, Selector, selector
@@ -28,7 +29,7 @@ from pmutools.impair.source_faults import (
     WrongIdcode,
 )
 from pmutools.impair.wire_faults import Bits, Change, Truncate, WrongChk, WrongSize, WrongSync
-from pmutools.parsers import choice, one_of, parsed_by, probability
+from pmutools.parsers import choice, one_of, parsed_by
 
 
 class Kind(Protocol):
@@ -55,25 +56,13 @@ KINDS: dict[str, type[Kind]] = {
     "repeat": RepeatedStamp,
     "value": FalseValues,
 }
-_kind = one_of(KINDS, "content fault")
-
-
-class Fault(NamedTuple):
-    p: float
-    kind: Kind
-
-
-def fault(text: str) -> Fault:
-    """``[P%] [KIND(...)]``: one bit where no kind is given, every frame where no probability is."""
-    head, _, rest = text.partition(" ")
-    if head[:1] in "0123456789.":
-        return Fault(probability(head), _kind(rest) if rest.strip() else Bits())
-    return Fault(1.0, _kind(text))
+_ONE_BIT: Kind = Bits()
+_fault = with_probability(one_of(KINDS, "content fault"), "bits(3)", alone=_ONE_BIT)
 
 
 @dataclass(frozen=True, slots=True)
 class Corrupt:
-    fault: Fault = field(metadata=parsed_by(fault))
+    fault: Chanced[Kind] = field(metadata=parsed_by(_fault))
     field_: str = field(default="", metadata=parsed_by(choice(*FIELDS)))
     station: str = field(default="", metadata=parsed_by(str))
     bytes_: Span = field(default=WHOLE, metadata=parsed_by(byte_span))

@@ -37,25 +37,25 @@ class Switch:
         return self.release == "burst"
 
 
-@dataclass(frozen=True, slots=True)
-class Disable:
+@dataclass(frozen=True)
+class _Scheduled:
     when: Selector = field(metadata=parsed_by(selector_of_any))
-    release: str = field(default="skip", metadata=parsed_by(choice("skip", "burst")))
-    tcp: Hangup = field(default=Hangup.SILENCE, metadata=parsed_by(_hangup))
+
+
+@dataclass(frozen=True)
+class Disable(Switch, _Scheduled):  # the fields of the last base come first
+    """A switch with its schedule."""
 
 
 class Gate:
     """The schedule of one stream's silences; ``draws`` gives the draws of a stage by its name."""
 
     def __init__(self, parts: Sequence[Disable], draws: Callable[[str], Draws]) -> None:
-        self._closures = [
-            (part.when.test(draws(f"{name}.when")), Switch(part.release, part.tcp))
-            for name, part in named_parts("disable", parts)
-        ]
+        self._closures = [(part.when.test(draws(f"{name}.when")), part) for name, part in named_parts("disable", parts)]
 
     def closure(self, at: Moment) -> Switch | None:
         """How the stream is silent; None where it is not."""
-        for closes, switch in self._closures:
+        for closes, part in self._closures:
             if closes(at):
-                return switch
+                return part
         return None

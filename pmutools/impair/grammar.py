@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-from pmutools.parsers import Call, bind
+from pmutools.parsers import Call, Parser, bind, probability
 
 T = TypeVar("T")
 
@@ -41,6 +41,29 @@ def phrase(text: str) -> Call:
 def parse_stage(cls: type[T], text: str) -> T:
     """A stage's dataclass from its value; raises ValueError."""
     return bind(cls, phrase(text))
+
+
+class Chanced(NamedTuple, Generic[T]):
+    """What is done, and how likely it is for a frame."""
+
+    p: float
+    kind: T
+
+
+def with_probability(kind: Parser[T], example: str, alone: T | None = None) -> Parser[Chanced[T]]:
+    """A parser of ``[P%] KIND(...)``: every frame where no probability is given, ``alone`` where no kind is."""
+
+    def parse(text: str) -> Chanced[T]:
+        head, _, rest = text.partition(" ")
+        if head[:1] not in "0123456789.":
+            return Chanced(1.0, kind(text))
+        if rest.strip():
+            return Chanced(probability(head), kind(rest))
+        if alone is None:
+            raise ValueError(f"{text}: write what is done, as in {head} {example}")
+        return Chanced(probability(head), alone)
+
+    return parse
 
 
 def named_parts(option: str, parts: Sequence[T]) -> Iterator[tuple[str, T]]:

@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from pmutools.c37118.config import StreamConfig
-from pmutools.flow import Hangup, Segmentation
+from pmutools.flow import Segmentation
 
 
 class Fate(StrEnum):
@@ -19,7 +19,7 @@ class Fate(StrEnum):
     """By ``drop``."""
     DISABLED = "disabled"
     SKIPPED = "skipped"
-    """Due, but passed over by the player (a seek, a late policy, no client)."""
+    """Due, but no client wanted it."""
     FAILED = "failed"
     """The operating system refused it, or a fault cut its connection."""
 
@@ -30,7 +30,7 @@ class Outgoing(NamedTuple):
     ``copy`` is 0 for the frame itself, 1, 2... for duplicates; ``delay_ns`` is what the delay stage added.
     ``config`` is the configuration that ``data`` follows (None: the source's own) and ``notice`` whether one that
     differs from the frame's before is sent unasked. ``write`` is for byte streams: how the frame is written (None:
-    whole, at once); ``hangup``, of a disabled frame, what TCP clients see of the silence.
+    whole, at once).
     """
 
     index: int  # type: ignore[assignment]  # not tuple.index
@@ -45,7 +45,6 @@ class Outgoing(NamedTuple):
     write: Segmentation | None = None
     tag: object = None
     """Whatever came with the frame."""
-    hangup: Hangup = Hangup.SILENCE
 
     @property
     def faults(self) -> str:

@@ -43,7 +43,6 @@ class _Held(NamedTuple):
 
     row: Outgoing
     at: Moment
-    hangup: Hangup
 
 
 class Pipeline:
@@ -344,7 +343,7 @@ class Pipeline:
         self._closed = self._gate.closure(at)
         silence = self._switch or self._closed
         if silence is not None:
-            frame = _Held(row, at, silence.tcp)
+            frame = _Held(row, at)
             if not silence.holds:
                 return (*flushed, _disabled(frame))
             self._held.append(frame)
@@ -353,7 +352,7 @@ class Pipeline:
         if not (flushed or self._held):
             return send(row, at)
         rows = list(flushed)
-        for kept, then, _ in self._held:
+        for kept, then in self._held:
             rows += send(kept._replace(offset_ns=row.offset_ns, marks=(*kept.marks, "burst")), then)
         self._held.clear()
         self._refresh()
@@ -463,4 +462,4 @@ class Pipeline:
 
 
 def _disabled(frame: _Held) -> Outgoing:
-    return frame.row._replace(fate=Fate.DISABLED, hangup=frame.hangup)
+    return frame.row._replace(fate=Fate.DISABLED)

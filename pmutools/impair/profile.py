@@ -12,7 +12,7 @@
     [at 12.5]                 ; seconds of stream time
     do = disable N1 tcp=rst
          fault N2 loss=gemodel(1%, 20%)
-         pause 5              ; the player's verbs: pause S, seek T, speed X, loop A B, loop off
+         pause 5              ; a verb of the player's, see :mod:`pmutools.impair.verbs`
 """
 
 from __future__ import annotations
@@ -126,10 +126,6 @@ class Profile:
             treatment = treatment.under(rule, names, stations)
         return treatment
 
-    def stages(self, names: Iterable[str]) -> Stages:
-        """What a stream known by these names goes through before the timeline changes it."""
-        return self.treatment(tuple(names)).stages
-
     def then(self, other: Profile) -> Profile:
         """This profile with ``other`` (say, the command line's options) on top."""
         timeline = sorted((*self.timeline, *other.timeline), key=lambda action: action.at_ns)
@@ -137,10 +133,14 @@ class Profile:
         return Profile(self.rules + other.rules, tuple(timeline), seed)
 
     def unmatched(self, streams: Iterable[Iterable[str]]) -> tuple[str, ...]:
-        """Patterns of the rules that fit none of the streams (each given by its names): most likely misspelt."""
+        """Patterns of rules and timeline that fit none of the streams (each given by its names), each once.
+
+        Most likely they are misspelt.
+        """
         known = [tuple(names) for names in streams]
-        rules = [rule for rule in self.rules if not any(rule.matches(names) for names in known)]
-        return tuple(", ".join(rule.patterns) for rule in rules)
+        rules = (*self.rules, *(action.rule for action in self.timeline if action.rule is not None))
+        missed = (rule.patterns for rule in rules if not any(rule.matches(names) for names in known))
+        return tuple(dict.fromkeys(map(", ".join, missed)))
 
 
 def parse_profile(text: str, source: str, read: ReadText | None = None) -> Profile:

@@ -12,14 +12,13 @@ from typing import NamedTuple, Protocol
 from pmutools.draws import Draws
 from pmutools.flow import Cut, Segmentation
 from pmutools.impair.blocks import chance
-from pmutools.impair.grammar import named_parts
+from pmutools.impair.grammar import Chanced, named_parts, with_probability
 from pmutools.impair.moment import Moment, Test
 from pmutools.impair.outgoing import Outgoing
 from pmutools.impair.selectors import DATA, Selector, selector
-from pmutools.parsers import duration_ns, integer, one_of, parsed_by, probability
+from pmutools.parsers import duration_ns, integer, milliseconds_ns, one_of, parsed_by
 
 _MS_NS = 1_000_000
-_milliseconds = duration_ns(_MS_NS)
 _some_milliseconds = duration_ns(_MS_NS, 1e-6)
 
 
@@ -38,7 +37,7 @@ class Split:
     """In ``parts`` writes, ``gap`` ms apart."""
 
     parts: int = field(default=2, metadata=parsed_by(integer(2, 1000)))
-    gap: int = field(default=5 * _MS_NS, metadata=parsed_by(_milliseconds))
+    gap: int = field(default=5 * _MS_NS, metadata=parsed_by(milliseconds_ns))
 
     @property
     def write(self) -> Segmentation:
@@ -95,27 +94,12 @@ class Reset:
 
 
 KINDS: dict[str, type[Kind]] = {"split": Split, "coalesce": Coalesce, "stall": Stall, "reset": Reset}
-_kind = one_of(KINDS, "way to write")
-
-
-class Chosen(NamedTuple):
-    p: float
-    kind: Kind
-
-
-def chosen(text: str) -> Chosen:
-    """``[P%] KIND(...)``; every frame where no probability is given."""
-    head, _, rest = text.partition(" ")
-    if head[:1] in "0123456789.":
-        if not rest.strip():
-            raise ValueError(f"{text}: write what is done, as in {head} split(parts=2, gap=5)")
-        return Chosen(probability(head), _kind(rest))
-    return Chosen(1.0, _kind(text))
+_chosen = with_probability(one_of(KINDS, "way to write"), "split(parts=2, gap=5)")
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    chosen: Chosen = field(metadata=parsed_by(chosen))
+    chosen: Chanced[Kind] = field(metadata=parsed_by(_chosen))
     when: Selector = field(default=DATA, metadata=parsed_by(selector))
 
 

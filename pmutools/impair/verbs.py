@@ -2,52 +2,36 @@
 
 ::
 
-    pause [S]    resume    step [N]    seek T    speed X    loop A B | loop off    stats
+    pause [SECONDS]    resume    step [FRAMES]    seek SECONDS|UTC    speed FACTOR    loop FROM TO | loop off
 
-S in seconds; T, A and B in seconds into the source, or ISO-8601 UTC; X times real time, 0.001 to 1000.
+Times in seconds into the source, from when its first frame is due, or ISO-8601 UTC; FACTOR times real time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from typing import NamedTuple
 
-from pmutools.parsers import duration_ns, integer, number, seconds_ns
-from pmutools.timebase import NS, parse_utc
-
-
-class Place(NamedTuple):
-    """A time in the source: ns from its first stamp (``relative``), or POSIX UTC."""
-
-    ns: int
-    relative: bool
-
+from pmutools.parsers import Place, duration_ns, integer, number, parse_place
+from pmutools.timebase import NS
 
 Value = int | Fraction | Place
 Values = tuple[Value, ...]
 
-
-def place(text: str) -> Place:
-    """``12.5`` (seconds into the source) or ``2016-09-08T17:05:11Z``; raises ValueError."""
-    try:
-        Decimal(text)
-    except InvalidOperation:
-        pass
-    else:
-        return Place(seconds_ns(text), relative=True)
-    try:
-        return Place(parse_utc(text), relative=False)
-    except ValueError:
-        raise ValueError(
-            f"{text!r} is no time; write seconds into the source (12.5) or UTC (2016-09-08T17:05:11Z)"
-        ) from None
-
-
 _pause_ns = duration_ns(NS, 0.001)
 _steps = integer(1, 1_000_000)
-_speed = number(0.001, 1000)
+SPEEDS = (0.001, 1000.0)
+"""Limits of a speed."""
+SPEED_DENOMINATOR = 1_000_000
+"""A speed is the nearest fraction with no greater one: deadlines are computed in 64 bits."""
+_speed = number(*SPEEDS)
+
+
+def speed(text: str) -> Fraction:
+    """Source seconds per second, within :data:`SPEEDS`; raises ValueError."""
+    _speed(text)
+    return Fraction(text.strip()).limit_denominator(SPEED_DENOMINATOR)
 
 
 def _pause(words: Sequence[str]) -> Values:
@@ -59,12 +43,11 @@ def _step(words: Sequence[str]) -> Values:
 
 
 def _seek(words: Sequence[str]) -> Values:
-    return (place(words[0]),)
+    return (parse_place(words[0], 0),)
 
 
 def _factor(words: Sequence[str]) -> Values:
-    _speed(words[0])
-    return (Fraction(words[0]).limit_denominator(SPEED_DENOMINATOR),)
+    return (speed(words[0]),)
 
 
 def _loop(words: Sequence[str]) -> Values:
@@ -72,7 +55,7 @@ def _loop(words: Sequence[str]) -> Values:
         if words[0].lower() != "off":
             raise ValueError("a loop has two ends")
         return ()
-    first, last = place(words[0]), place(words[1])
+    first, last = parse_place(words[0], 0), parse_place(words[1], 0)
     if first.relative is last.relative and last.ns <= first.ns:
         raise ValueError(f"{words[0]} {words[1]} runs backwards")
     return first, last
@@ -93,8 +76,6 @@ class Verb(NamedTuple):
     """Why a timeline cannot have it."""
 
 
-SPEED_DENOMINATOR = 1_000_000
-"""A speed is the nearest fraction with no greater one: deadlines are computed in 64 bits."""
 _STILL = "stream time stands still in a pause, so it would never come; write 'pause SECONDS', which ends by itself"
 PLAYER: dict[str, Verb] = {
     "pause": Verb("pause [SECONDS]", 0, 1, _pause),
@@ -103,7 +84,6 @@ PLAYER: dict[str, Verb] = {
     "seek": Verb("seek SECONDS|UTC", 1, 1, _seek),
     "speed": Verb("speed FACTOR", 1, 1, _factor),
     "loop": Verb("loop FROM TO | loop off", 1, 2, _loop),
-    "stats": Verb("stats", 0, 0, _nothing, "it answers whoever asks; the ledger and the summary tell what was done"),
 }
 
 

@@ -7,41 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmutools import timebase
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
 from pmutools.c37118.frames import stamp_ns
-from pmutools.errors import SettingsError
 from pmutools.formats.source import Block
+from pmutools.parsers import Place
 
 FOREVER = 1 << 62
 """Further from 1970 than any stamp, in ns."""
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """A time in a recording: seconds into the source (``relative``), or POSIX UTC; in ns."""
-
-    ns: int
-    relative: bool
-
-    def resolve(self, first_ns: int) -> int:
-        """POSIX UTC ns, given the source's first stamp."""
-        return max(-FOREVER, min(first_ns + self.ns if self.relative else self.ns, FOREVER))
-
-
-def parse_moment(text: str) -> Moment:
-    """``12.5`` (seconds into the source) or an ISO-8601 UTC time; raises SettingsError for anything else."""
-    try:
-        return Moment(round(float(text) * timebase.NS), relative=True)
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return Moment(timebase.parse_utc(text), relative=False)
-    except ValueError:
-        raise SettingsError(
-            f"{text!r} is no time: give seconds into the source (12.5) or UTC (2016-09-08T17:05:11Z)"
-        ) from None
 
 
 @dataclass
@@ -53,8 +26,8 @@ class Window:
     first stamp from what it is shown.
     """
 
-    start: Moment | None = None
-    end: Moment | None = None
+    start: Place | None = None
+    end: Place | None = None
     duration_ns: int | None = None
     idcodes: Collection[int] = ()
     _low: int | None = None
@@ -71,8 +44,8 @@ class Window:
         ``time_ns`` is the stamp of the frame at hand; that of the first call is the source's first.
         """
         if self._low is None or self._high is None:
-            self._low = self.start.resolve(time_ns) if self.start else -FOREVER
-            self._high = self.end.resolve(time_ns) if self.end else FOREVER
+            self._low = _resolved(self.start, time_ns) if self.start else -FOREVER
+            self._high = _resolved(self.end, time_ns) if self.end else FOREVER
             if self.duration_ns is not None:
                 self._high = min(self._high, max(self._low, time_ns) + self.duration_ns, FOREVER)
         return self._low, self._high
@@ -118,3 +91,8 @@ class Window:
         elif len(rows):
             for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
                 yield Block(flow, batch[int(run[0]) : int(run[-1]) + 1])
+
+
+def _resolved(place: Place, first_ns: int) -> int:
+    """POSIX UTC ns, given the source's first stamp."""
+    return max(-FOREVER, min(first_ns + place.ns if place.relative else place.ns, FOREVER))

@@ -74,7 +74,7 @@ MISTAKES = [
     (f"play good.pcap --to {NOWHERE} --fps 0", 2, "'--fps': 0 is out of range"),
     (f"play good.pcap --to {NOWHERE} --loop -1", 2, "'--loop'"),
     (f"play good.pcap --to {NOWHERE} --stamp never", 2, "'--stamp': 'never' is not one of 'shift', 'keep'"),
-    (f"play good.pcap --to {NOWHERE} --start yesterday", 2, "'--start': 'yesterday' is no time: give seconds"),
+    (f"play good.pcap --to {NOWHERE} --start yesterday", 2, "'--start': 'yesterday' is no time; write seconds"),
     (f"play good.pcap --to {NOWHERE} --start 100", 1, "nothing is left to play; widen --start and --end"),
     (f"play good.pcap --to {NOWHERE} --select N9", 2, "--select N9: no such stream; there are "),
     (f"play good.pcap --to {NOWHERE} --fps 30 --interval 10", 2, "--fps and --interval clash"),
@@ -147,9 +147,21 @@ def test_a_port_in_use_is_named_with_a_remedy(pmu: Pmu, kind: str) -> None:
 def test_two_streams_of_one_idcode_cannot_be_listened_to(pmu: Pmu) -> None:
     for name in ("one.csv", "two.csv"):
         assert pmu("convert", "good.pcap", name, "--idcode", 101).code == 0
-    result = pmu("play", "one.csv", "two.csv", "--listen", "tcp://127.0.0.1:0")
+    for where in (("--listen", "tcp://127.0.0.1:0"), ("--to", "udp://127.0.0.1:9")):
+        result = pmu("play", "one.csv", "two.csv", *where)
+        assert result.code == 2
+        assert "N1 and N1#2 both have IDCODE 101; choose one with --select, or renumber it: --idcode 'N1#2=N'" in result.complaint
+    mended = pmu("play", "one.csv", "two.csv", "--to", "udp://127.0.0.1:9", "--idcode", "N1#2=501", "--end", 0.1)
+    assert mended.code == 0
+    result = pmu("play", "one.csv", "--to", "udp://127.0.0.1:9", "--idcode", "N9=5")
     assert result.code == 2
-    assert "N1 and N1#2 both have IDCODE 101; choose one with --select or --exclude" in result.complaint
+    assert "--idcode N9=5: no such stream; there are N1" in result.complaint
+
+
+def test_a_time_that_is_past_is_none_to_begin_at(pmu: Pmu) -> None:
+    result = pmu("play", "good.pcap", "--to", "udp://127.0.0.1:9", "--at", "2001-01-01T00:00:00Z")
+    assert result.code == 2
+    assert "--at 2001-01-01T00:00:00.000000000Z is past" in result.complaint
 
 
 def test_a_capture_of_something_else_holds_no_frames(pmu: Pmu, foreign: Path) -> None:

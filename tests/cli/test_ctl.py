@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.commands import Pmu
-from support.controlled import FakePlayer, player_status
+from support.controlled import FakePlayer, player_status, whole_json
 
 from pmutools.cli.status_text import fit, layout, number, progress_line, status_lines
 from pmutools.clock import SystemClock
@@ -65,7 +64,7 @@ def test_it_is_done_in_silence(pmu: Pmu, player: FakePlayer, words: list[str], d
 
 def test_json_gives_the_answer(pmu: Pmu, player: FakePlayer) -> None:
     assert pmu("ctl", "player.sock", "pause", "--json").json == {"id": 1, "ok": True}
-    assert pmu("ctl", "player.sock", "stats", "--json").json == json.loads(json.dumps(player.now.to_json()))
+    assert pmu("ctl", "player.sock", "stats", "--json").json == whole_json(player.now)
 
 
 def test_stats_is_a_table(pmu: Pmu, player: FakePlayer) -> None:
@@ -85,7 +84,7 @@ def test_watching_ends_with_the_player(pmu: Pmu, player: FakePlayer) -> None:
 def test_a_refusal_is_one_line(pmu: Pmu, player: FakePlayer) -> None:
     result = pmu("ctl", "player.sock", "enable", "N9")
     assert (result.code, result.out) == (1, "")
-    assert result.complaint == "pmu: player.sock: no stream is called 'N9'; there are N1, S1"
+    assert result.complaint == "pmu: player.sock: enable N9: no such stream; there are N1, N2, S1, S2, E1, E2, W1, W2"
 
 
 MISTAKES = [

@@ -126,7 +126,7 @@ def test_keys_reach_the_player_and_the_screen_follows() -> None:
         on.type(b"loss=5%\r")
         on.run_until(lambda: on.player.done[-1] == "fault N2")
         on.type(b":enable N9\r")
-        on.run_until(lambda: "no stream is called 'N9'" in on.screen)
+        on.run_until(lambda: "enable N9: no such stream" in on.screen)
         on.display.note("127.0.0.1:5000 started 101")
         on.run_until(lambda: "127.0.0.1:5000 started 101" in on.screen)
         resize(on.slave, 120, 40)

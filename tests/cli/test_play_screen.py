@@ -10,15 +10,14 @@ from rich.text import Text
 from support.controlled import player_status, stream_status
 
 from pmutools.cli.play_keys import KEYS, Prompt, Ui
-from pmutools.cli.play_screen import Title, page_rows, render
+from pmutools.cli.play_screen import Title, lines, page_rows
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState
 
 TITLE = Title("cjb-8pmu.pcap", ("udp://127.0.0.1:4713", "tcp://0.0.0.0:4712"))
 
 
 def picture(status: PlayerStatus, ui: Ui, size: tuple[int, int], reached: float | None = None) -> list[Text]:
-    made = render(status, ui, TITLE, *size, reached).renderables
-    return [line for line in made if isinstance(line, Text)]
+    return list(lines(status, ui, TITLE, *size, reached))
 
 
 def drawn(

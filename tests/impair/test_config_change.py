@@ -10,8 +10,10 @@ from support.impairment import CONFIG, CONFIG_FRAME, PERIOD_NS, frame, options, 
 from pmutools.c37118 import FrameType, StreamConfig, as_kind, decode_config, decode_data, encode_config
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.constants import Stat
+from pmutools.draws import Draws
 from pmutools.errors import SettingsError
 from pmutools.impair import Outgoing, Pipeline, parse_action
+from pmutools.impair.config_change import KEPT, Reconfiguration
 from pmutools.impair.stages import parse_setting
 
 
@@ -188,3 +190,13 @@ def test_what_this_stream_cannot_have(text: str, message: str) -> None:
     assert str(error.value).startswith(message)
     with pytest.raises(SettingsError, match="stream N1: config: only a stream whose configuration is known"):
         Pipeline(options("config=count()"), "N1")
+
+
+def test_any_combination_of_parts_is_made_and_few_are_kept() -> None:
+    parts = [parse_setting("config", f"add({1 << part}) when=50%").parts[0] for part in range(8)]
+    changes = Reconfiguration(parts, lambda name: Draws(1, "N1", name), CONFIG)
+    for combination in (*range(1, 256), *range(1, 256)):
+        active = tuple(bool(combination >> part & 1) for part in range(8))
+        config = changes.config(active)
+        assert config is not None and len(config.stations[0].analogs) == combination
+        assert changes._changed.cache_info().currsize <= KEPT

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.impairment import CONFIG, PERIOD_NS, delays_ms, frame, options, pipeline, play
 
-from pmutools.errors import SettingsError, SourceError
+from pmutools.errors import SettingsError
 from pmutools.impair import (
     OPTIONS,
     READY,
@@ -50,11 +50,11 @@ do = enable N1
 def test_rules_apply_in_order() -> None:
     profile = parse_profile(EXAMPLE, "p.ini")
     assert profile.seed == 7
-    one, two, other = (profile.stages([name]) for name in ("N1", "n2", "S1"))
+    one, two, other = (profile.treatment([name]).stages for name in ("N1", "n2", "S1"))
     assert len(one.delay) == 1 and len(one.corrupt) == 2 and not one.loss
     assert len(two.delay) == 2 and len(two.loss) == 1
     assert other == type(other)()
-    assert profile.stages(["X", "101"]) == one
+    assert profile.treatment(["X", "101"]).stages == one
     assert [(action.at_ns, action.verb) for action in profile.timeline] == [
         (3_000_000_000, "enable"),
         (12_500_000_000, "disable"),
@@ -86,8 +86,8 @@ def test_one_grammar() -> None:
     }
     assert values.keys() == OPTIONS.keys()
     for option, text in values.items():
-        in_file = parse_profile(f"[stream *]\n{option} = {text}\n", "p.ini").stages(["N1"])
-        assert in_file == profile_of_options([(option, text)]).stages(["N1"])
+        in_file = parse_profile(f"[stream *]\n{option} = {text}\n", "p.ini").treatment(["N1"]).stages
+        assert in_file == profile_of_options([(option, text)]).treatment(["N1"]).stages
         live = pipeline(parse_profile("", "p.ini"))
         assert live.act(parse_action(f"fault N1 {option}={text}"))
         assert live.stages == in_file != type(in_file)()
@@ -97,30 +97,34 @@ def test_options_of_a_command_line() -> None:
     profile = options(
         "disable=N1@5..8", "disable=N1@10..", "loss=S*,201@5%", "delay=constant(5)", "corrupt=chk", "corrupt=sync"
     )
-    north, south = profile.stages(["N1"]), profile.stages(["S9"])
+    north, south = profile.treatment(["N1"]).stages, profile.treatment(["S9"]).stages
     assert len(north.disable) == 2 and not north.loss
     assert len(south.loss) == 1 and not south.disable
-    assert profile.stages(["201"]) == south
+    assert profile.treatment(["201"]).stages == south
     assert len(north.corrupt) == 2 and len(north.delay) == 1
     on_top = ready_profile("table1").then(options("delay=constant(5)"))
-    assert on_top.stages(["N1"]) == options("delay=constant(5)").stages(["N1"])
-    assert ready_profile("table1").then(options("delay=none")).stages(["N1"]).delay == ()
+    assert on_top.treatment(["N1"]).stages == options("delay=constant(5)").treatment(["N1"]).stages
+    assert ready_profile("table1").then(options("delay=none")).treatment(["N1"]).stages.delay == ()
 
 
 def test_misspelt_streams_are_found() -> None:
     profile = parse_profile("[stream N1]\nloss = 1%\n[stream Q*, Z]\nloss = 1%\n", "p.ini")
     assert profile.unmatched([("N1", "101"), ("S1", "201")]) == ("Q*, Z",)
     assert profile.unmatched([("N1",), ("z",)]) == ()
+    profile = parse_profile(
+        "[at 1]\ndo = disable TYPO\n     pause 1\n[at 2]\ndo = enable TYPO\n     enable N1\n", "p.ini"
+    )
+    assert profile.unmatched([("N1", "101")]) == ("TYPO",)
 
 
 def test_numbers_from_a_file(tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("# ms\n10, 20\n30 40\n")
     path = tmp_path / "p.ini"
     path.write_text("[stream *]\ndelay = trace(@delays.txt) + empirical(1, @delays.txt)\n")
-    stages = read_profile_file(path).stages(["N1"])
-    assert stages == options("delay=trace(10,20,30,40) + empirical(1,10,20,30,40)").stages(["N1"])
+    stages = read_profile_file(path).treatment(["N1"]).stages
+    assert stages == options("delay=trace(10,20,30,40) + empirical(1,10,20,30,40)").treatment(["N1"]).stages
     path.write_text("[stream *]\nloss = trace(@missing.txt)\n")
-    with pytest.raises(SourceError, match=r"missing\.txt: No such file"):
+    with pytest.raises(SettingsError, match=r"p\.ini:2: .* loss: .*missing\.txt: No such file"):
         read_profile_file(path)
     with pytest.raises(SettingsError, match=r"--loss: @x: no file can be named here"):
         options("loss=trace(@x)")

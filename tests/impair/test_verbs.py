@@ -33,7 +33,6 @@ UTC = "2016-09-08T17:05:11Z"
         ("loop 5 8.5", (Place(5 * NS, True), Place(17 * NS // 2, True))),
         (f"loop 5 {UTC}", (Place(5 * NS, True), Place(parse_utc(UTC), False))),
         ("loop off", ()),
-        ("stats", ()),
     ],
 )
 def test_arguments_are_read(text: str, values: Values) -> None:
@@ -51,7 +50,7 @@ def test_arguments_are_read(text: str, values: Values) -> None:
         ("step 0", "step: 0 is out of range; it must be 1 to 1e+06; write 'step [FRAMES]'"),
         ("seek", "seek: write 'seek SECONDS|UTC'"),
         ("seek -5", "seek: -5 is out of range; it must be at least 0; write 'seek SECONDS|UTC'"),
-        ("seek nan", "seek: nan is not a finite number"),
+        ("seek nan", "seek: nan is no time"),
         ("seek noon", "seek: 'noon' is no time; write seconds into the source (12.5) or UTC (2016-09-08T17:05:11Z)"),
         ("speed 0", "speed: 0 is out of range; it must be 0.001 to 1000; write 'speed FACTOR'"),
         ("speed 1e9999999", "speed: "),
@@ -59,7 +58,6 @@ def test_arguments_are_read(text: str, values: Values) -> None:
         ("loop", "loop: write 'loop FROM TO | loop off'"),
         ("loop 5", "loop: a loop has two ends; write 'loop FROM TO | loop off'"),
         ("loop 8 5", "loop: 8 5 runs backwards; write 'loop FROM TO | loop off'"),
-        ("stats all", "stats all: write 'stats'"),
         ("rewind", "'rewind' is nothing to do; "),
     ],
 )
@@ -112,7 +110,7 @@ def test_a_timeline_has_the_players_verbs() -> None:
         ("pause soon", "pause: 'soon' is not a number; write 'pause [SECONDS]'"),
         ("resume", "resume cannot be scheduled: stream time stands still in a pause, so it would never come;"),
         ("step 5", "step cannot be scheduled: stream time stands still in a pause, so it would never come;"),
-        ("stats", "stats cannot be scheduled: it answers whoever asks;"),
+        ("stats", "'stats' is nothing to do; "),
         ("loop 9 8", "loop: 9 8 runs backwards; write 'loop FROM TO | loop off'"),
         ("speed 2000", "speed: 2000 is out of range; it must be 0.001 to 1000; write 'speed FACTOR'"),
     ],
@@ -124,4 +122,4 @@ def test_timeline_errors_name_file_and_line(text: str, message: str) -> None:
 
 
 def test_all_verbs_are_known() -> None:
-    assert PLAYER_VERBS == ("pause", "resume", "step", "seek", "speed", "loop", "stats")
+    assert PLAYER_VERBS == ("pause", "resume", "step", "seek", "speed", "loop")

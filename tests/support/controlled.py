@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from typing import Any, cast
 
 from pmutools.errors import SettingsError
 from pmutools.impair.profile import Action
+from pmutools.parsers import no_such_stream
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState, StreamStatus
 
 NAMES = ("N1", "N2", "S1", "S2", "E1", "E2", "W1", "W2")
@@ -43,6 +46,12 @@ def player_status(streams: int = 8) -> PlayerStatus:
     )
 
 
+def whole_json(status: PlayerStatus) -> dict[str, Any]:
+    """A state as it goes over the wire."""
+    said = status.to_json() | {"streams": [stream.to_json() for stream in status.streams]}
+    return cast("dict[str, Any]", json.loads(json.dumps(said)))
+
+
 class FakePlayer:
     """Obeys what changes its state, notes all, refuses stream N9."""
 
@@ -54,7 +63,7 @@ class FakePlayer:
     def act(self, action: Action) -> None:
         patterns = ",".join(action.rule.patterns) if action.rule else ""
         if patterns == "N9":
-            raise SettingsError("no stream is called 'N9'; there are N1, S1")
+            raise SettingsError(no_such_stream(f"{action.verb} {patterns}", NAMES[: len(self.now.streams)]))
         self.actions.append(action)
         self.done.append(" ".join(filter(None, (action.verb, patterns, action.argument))))
         match action.verb:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.controlled import FakePlayer, player_status
+from support.controlled import FakePlayer, player_status, whole_json
 from support.peers import free_port
 
 from pmutools.clock import SystemClock
@@ -23,8 +23,9 @@ from pmutools.net.reactor import Reactor
 from pmutools.timebase import NS
 from pmutools.tools.player import control_server
 from pmutools.tools.player.control_address import ControlAddress, parse_control_address
-from pmutools.tools.player.control_client import ControlClient, Refused, status_of
+from pmutools.tools.player.control_client import ControlClient, Refused
 from pmutools.tools.player.control_server import MAX_CLIENTS, ControlServer
+from pmutools.tools.player.status import PlayerStatus
 
 pytestmark = [
     pytest.mark.realtime,
@@ -366,9 +367,9 @@ def running(address: str | Path, streams: int = 8) -> Iterator[Stage]:
 @pytest.mark.parametrize("streams", [0, 8, 2000])
 def test_a_state_comes_through_whole(path: Path, streams: int) -> None:
     with running(path, streams), ControlClient(parse_control_address(str(path))) as client:
-        assert status_of(client.ask("stats")["result"]) == player_status(streams)
+        assert PlayerStatus.from_json(client.ask("stats")["result"]) == player_status(streams)
         assert client.ask("pause")["ok"] is True
-        with pytest.raises(Refused, match="no stream is called 'N9'; there are N1, S1"):
+        with pytest.raises(Refused, match="disable N9: no such stream; there are"):
             client.ask("disable N9")
 
 
@@ -424,7 +425,7 @@ def test_nobody_there(path: Path) -> None:
         ControlClient(ControlAddress(str(path)))
 
 
-@pytest.mark.parametrize("result", [None, {}, {"streams": 5}, player_status().to_json() | {"state": "dancing"}])
+@pytest.mark.parametrize("result", [None, {}, {"streams": 5}, whole_json(player_status()) | {"state": "dancing"}])
 def test_a_state_that_is_none(result: Any) -> None:
     with pytest.raises(SourceError, match="is not understood"):
-        status_of(result)
+        PlayerStatus.from_json(result)

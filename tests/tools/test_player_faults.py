@@ -30,7 +30,8 @@ from pmutools.clock import VirtualClock
 from pmutools.impair.outgoing import UNREPEATABLE, LedgerRow
 from pmutools.impair.profile import Profile, parse_profile
 from pmutools.net.cargo import I64, Frames
-from pmutools.tools.window import Window, parse_moment
+from pmutools.parsers import parse_place
+from pmutools.tools.window import Window
 
 Row = dict[str, Any]
 
@@ -83,7 +84,7 @@ def test_drop_list_counts_the_data_frames_of_each_stream(tmp_path: Path) -> None
 
 
 def test_drop_list_is_not_reset_by_loops_and_counts_over_the_source() -> None:
-    window = Window(parse_moment("1"), parse_moment("2"))  # frames 50 to 99 of 150
+    window = Window(parse_place("1"), parse_place("2"))  # frames 50 to 99 of 150
     played = play(recording(stream(), 150), window=window, loops=2, profile=faults("drop=3,60,210"))
     assert played.numbers() == [*(k for k in range(50, 100) if k != 60), *(k for k in range(50, 100) if k != 60)]
 

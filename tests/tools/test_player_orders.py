@@ -10,6 +10,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from support.controlled import whole_json
 from support.playing import MS, START_NS, Played, Stage, config_of, faults, interleaved, play, recording, stream
 from support.recordings import write
 
@@ -22,9 +23,9 @@ from pmutools.impair.profile import parse_profile
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import emulated
 from pmutools.tools.player.control import ControlSession
-from pmutools.tools.player.control_client import status_of
 from pmutools.tools.player.material import Choice, material
 from pmutools.tools.player.play import Player
+from pmutools.tools.player.status import PlayerStatus
 
 LATE_NS = 10 * MS
 """A sheet: what is planned already cannot be changed."""
@@ -297,8 +298,8 @@ def test_the_status_goes_over_the_wire_and_comes_back() -> None:
         recording(stream(10), 250), cast=lambda reel: emulated(reel, 40, 1), orders=said | {3 * NS: "loop off\nresume"}
     )
     ((status, told),) = seen
-    assert told == json.loads(json.dumps(status.to_json()))
-    assert status_of(told).to_json() == status.to_json()
+    assert told == whole_json(status)
+    assert whole_json(PlayerStatus.from_json(told)) == told
     assert (len(status.streams), status.streams[-1].name, len(status.streams[3:5])) == (40, "PMU 10-40", 2)
     assert (status.between, status.speed, str(status.state)) == ((0.5, 3.0), 2.0, "paused")
     assert status.sent == sum(stream.fates["sent"] for stream in status.streams)

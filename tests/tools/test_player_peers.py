@@ -32,6 +32,7 @@ from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
 from pmutools.clock import SystemClock
 from pmutools.flow import StampSource
 from pmutools.net.endpoint import parse_endpoint
+from pmutools.parsers import parse_place
 from pmutools.timebase import NS
 from pmutools.tools.describe import describe
 from pmutools.tools.live import LiveSource
@@ -40,7 +41,7 @@ from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.material import Choice, material
 from pmutools.tools.player.play import Options, Player
 from pmutools.tools.recast import parse_form
-from pmutools.tools.window import Window, parse_moment
+from pmutools.tools.window import Window
 
 pytestmark = [
     pytest.mark.peer,
@@ -76,7 +77,7 @@ def existing(name: str) -> Path:
 
 
 def cast_of(name: str, span: str = SPAN, **choices: Any) -> Cast:
-    window = Window(None, parse_moment(span))
+    window = Window(None, parse_place(span))
     return material(Choice(files=[str(existing(name))], window=window, **choices)).cast
 
 

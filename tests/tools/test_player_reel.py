@@ -14,10 +14,11 @@ from support.playing import MS, START_NS, interleaved, play, recording, reel_of,
 
 from pmutools.c37118 import Format, FrameType, Message, PhasorChannel, Station, StreamConfig
 from pmutools.clock import VirtualClock
+from pmutools.parsers import parse_place
 from pmutools.timebase import NS, slot
 from pmutools.tools.player import reel as reel_module
 from pmutools.tools.player.reel import Reel, at_interval, at_rate, without_gaps
-from pmutools.tools.window import Window, parse_moment
+from pmutools.tools.window import Window
 
 
 def wide(idcode: int, phasors: int = 5, rate: int = 50) -> StreamConfig:
@@ -97,7 +98,7 @@ def test_a_file_on_disk_serves_as_memory_does(monkeypatch: pytest.MonkeyPatch, t
 def test_windows_count_from_the_first_stamp_of_the_source() -> None:
     late = recording(stream(2), 100, first_slot=25)
     source = interleaved(recording(stream(1), 100), late)
-    reel = reel_of(source, None, Window(parse_moment("0.5"), parse_moment("2016-09-08T17:05:12.5Z")))
+    reel = reel_of(source, None, Window(parse_place("0.5"), parse_place("2016-09-08T17:05:12.5Z")))
     assert reel.rows.number[reel.rows.track == 0].tolist() == [*range(25, 75)]
     assert reel.rows.number[reel.rows.track == 1].tolist() == [*range(50)]
     assert [track.total for track in reel.tracks] == [100, 100]

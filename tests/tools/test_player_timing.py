@@ -32,12 +32,13 @@ from pmutools.impair.pipeline import Pipeline
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.pacing import Playback
+from pmutools.parsers import parse_place
 from pmutools.timebase import NS, slot, slot_time_ns
 from pmutools.tools.player.cast import Cast, Spread, as_recorded, emulated
 from pmutools.tools.player.plan import Plan
 from pmutools.tools.player.reel import Reel
 from pmutools.tools.player.stamps import StampPolicy
-from pmutools.tools.window import Window, parse_moment
+from pmutools.tools.window import Window
 
 LISTEN = parse_endpoint("tcp://127.0.0.1:4712")
 NOW_NS = 1_790_000_000 * NS + 123_456_789
@@ -283,14 +284,14 @@ def test_duration_longer_than_the_source_serves_on_to_its_end() -> None:
 
 
 def test_start_and_end_cut_by_stamp_and_the_rest_is_due_now() -> None:
-    window = Window(parse_moment("1"), parse_moment("2016-09-08T17:05:13.5Z"))
+    window = Window(parse_place("1"), parse_place("2016-09-08T17:05:13.5Z"))
     played = play(recording(stream(), 200), clock=clock(), window=window)
     assert played.numbers() == [*range(50, 125)]
     assert 0 <= played.stamps()[0] - NOW_NS < NS
 
 
 def test_indices_count_over_the_source_whatever_part_is_played_and_over_its_loops() -> None:
-    window = Window(parse_moment("1"), parse_moment("1.1"))
+    window = Window(parse_place("1"), parse_place("1.1"))
     source = recording(stream(), 100)
     reel = reel_of(source, None, window)
     assert reel.rows.number.tolist() == [50 + k for k in range(5)]
@@ -315,7 +316,7 @@ def test_a_name_that_fits_no_stream_is_told_with_those_there_are() -> None:
     with pytest.raises(SourceError, match="no data frames"):
         play(recording(stream(), 0))
     with pytest.raises(SourceError, match="nothing is left"):
-        play(recording(stream(), 3), window=Window(parse_moment("60")))
+        play(recording(stream(), 3), window=Window(parse_place("60")))
 
 
 def test_streams_of_one_name_are_told_apart() -> None:

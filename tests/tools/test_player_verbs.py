@@ -528,7 +528,6 @@ def test_after_the_end_there_is_nothing_to_do() -> None:
     for order in ("pause", "seek 1", "disable *"):
         with pytest.raises(SettingsError, match="the play has ended"):
             played.player.act(parse_action(order))
-    played.player.act(parse_action("stats"))
 
 
 # --- by the timeline

@@ -17,13 +17,13 @@ from support.recordings import data_of, messages_of, write, written
 from pmutools.c37118 import FrameType, Message
 from pmutools.c37118.demux import Loss
 from pmutools.c37118.framer import Skipped, SkipReason
-from pmutools.errors import SettingsError
 from pmutools.formats import open_sink, open_source
 from pmutools.formats.source import Block, gather
+from pmutools.parsers import Place, parse_place
 from pmutools.timebase import NS
 from pmutools.tools.convert import convert
 from pmutools.tools.recordings import open_recordings
-from pmutools.tools.window import FOREVER, Moment, Window, parse_moment
+from pmutools.tools.window import FOREVER, Window
 
 STEP_NS = NS // 50
 
@@ -47,27 +47,26 @@ def times_of_blocks(window: Window, messages: list[Message], frames: int = 7) ->
 @pytest.mark.parametrize(
     ("text", "moment"),
     [
-        ("12.5", Moment(12_500_000_000, relative=True)),
-        ("0", Moment(0, relative=True)),
-        ("-3", Moment(-3 * NS, relative=True)),
-        ("2016-09-08T17:05:11Z", Moment(START_NS, relative=False)),
-        ("2016-09-08 19:05:11.25+02:00", Moment(START_NS + 250_000_000, relative=False)),
+        ("12.5", Place(12_500_000_000, relative=True)),
+        ("0", Place(0, relative=True)),
+        ("-3", Place(-3 * NS, relative=True)),
+        ("2016-09-08T17:05:11Z", Place(START_NS, relative=False)),
+        ("2016-09-08 19:05:11.25+02:00", Place(START_NS + 250_000_000, relative=False)),
     ],
 )
-def test_a_moment_is_seconds_into_the_source_or_utc(text: str, moment: Moment) -> None:
-    assert parse_moment(text) == moment
+def test_a_moment_is_seconds_into_the_source_or_utc(text: str, moment: Place) -> None:
+    assert parse_place(text) == moment
 
 
 @pytest.mark.parametrize("text", ["", "now", "nan", "inf", "2016-13-40T00:00:00Z", "12:30"])
 def test_what_is_no_moment_is_told(text: str) -> None:
-    with pytest.raises(SettingsError, match="is no time: give seconds into the source"):
-        parse_moment(text)
+    with pytest.raises(ValueError, match="is no time; write seconds into the source"):
+        parse_place(text)
 
 
 def test_a_moment_beyond_all_stamps_is_for_ever() -> None:
-    assert parse_moment("1e200").resolve(START_NS) == FOREVER
-    assert times_of_items(Window(end=parse_moment("1e200")), recording(stream(), 5)) != []
-    assert times_of_blocks(Window(start=parse_moment("-1e200")), recording(stream(), 5)) != []
+    assert times_of_items(Window(end=parse_place("1e200")), recording(stream(), 5)) != []
+    assert times_of_blocks(Window(start=parse_place("-1e200")), recording(stream(), 5)) != []
 
 
 # --- windows
@@ -87,10 +86,10 @@ def test_items_and_blocks_keep_what_lies_in_the_window(
     messages = interleaved(recording(stream(1), 30, slots=order), recording(stream(2), 20, first_slot=7))
     first = next(stamp_ns(m.frame.data, m.config) for m in messages if m.frame.type is FrameType.DATA)
 
-    def moment(slots: int | None) -> Moment | None:
+    def moment(slots: int | None) -> Place | None:
         if slots is None:
             return None
-        return Moment(slots * STEP_NS + (first if utc else 0), relative=not utc)
+        return Place(slots * STEP_NS + (first if utc else 0), relative=not utc)
 
     def window() -> Window:
         return Window(moment(start), moment(end), None if duration is None else duration * STEP_NS, idcodes)
@@ -112,7 +111,7 @@ def test_items_and_blocks_keep_what_lies_in_the_window(
 
 def test_the_first_stamp_is_the_sources_not_that_of_the_stream_picked() -> None:
     messages = interleaved(recording(stream(1), 100), recording(stream(2), 100, first_slot=50))
-    window = {"start": parse_moment("1.5"), "idcodes": [2]}
+    window = {"start": parse_place("1.5"), "idcodes": [2]}
     for times in (times_of_items(Window(**window), messages), times_of_blocks(Window(**window), messages)):  # type: ignore[arg-type]
         assert times[0] == START_NS + 75 * STEP_NS
 
@@ -120,9 +119,9 @@ def test_the_first_stamp_is_the_sources_not_that_of_the_stream_picked() -> None:
 def test_other_frames_and_losses_pass_whatever_their_time() -> None:
     messages: list[Message | Loss] = list(recording(stream(), 10))
     messages.append(Loss(Skipped(SkipReason.BAD_CHK, 0, 5), messages[0].flow))
-    kept = list(Window(start=parse_moment("100")).items(messages))
+    kept = list(Window(start=parse_place("100")).items(messages))
     assert kept == [messages[0], messages[-1]]
-    assert list(Window(start=parse_moment("100")).blocks(gather(iter(messages)))) == kept
+    assert list(Window(start=parse_place("100")).blocks(gather(iter(messages)))) == kept
 
 
 # --- conversions
@@ -165,7 +164,7 @@ def test_relative_times_count_from_the_earliest_of_several_recordings(tmp_path: 
     for name, slot in (("late", 100), ("early", 0)):
         write(tmp_path / f"{name}.parquet", recording(stream(3 + slot), 50, first_slot=slot))
     source = open_recordings([tmp_path / "late.parquet", tmp_path / "early.parquet"])
-    blocks = [b for b in Window(start=parse_moment("2.5")).blocks(source.blocks()) if isinstance(b, Block)]
+    blocks = [b for b in Window(start=parse_place("2.5")).blocks(source.blocks()) if isinstance(b, Block)]
     assert {int(block.batch.time_ns[0]) for block in blocks} == {START_NS + 125 * STEP_NS}
 
 

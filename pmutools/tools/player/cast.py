@@ -209,8 +209,7 @@ def as_recorded(reel: Reel, idcodes: Mapping[str, int] | None = None) -> Cast:
         for number, track in enumerate(reel.tracks)
     ]
     for name in new.keys() - {part.name for part in parts}:
-        there = ", ".join(part.name for part in parts)
-        raise SettingsError(f"--idcode {name}={new[name]}: no such stream; there are {there}")
+        raise SettingsError(parsers.no_such_stream(f"--idcode {name}={new[name]}", [part.name for part in parts]))
     return Cast(reel, parts)
 
 

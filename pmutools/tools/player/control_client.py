@@ -12,7 +12,6 @@ from pmutools.errors import PmuError, SourceError
 from pmutools.net.sockets import explain, resolve
 from pmutools.tools.player.control import PROTOCOL, to_json
 from pmutools.tools.player.control_address import ControlAddress
-from pmutools.tools.player.status import PacingStatus, PlayerStatus, PlayState, StreamStatus
 
 TIMEOUT_S = 5.0
 LINE_BYTES = 64 << 20
@@ -138,44 +137,3 @@ _REMEDIES = {
     errno.ENOTSOCK: "not a socket; give the path of pmu play --control",
     errno.EACCES: "not permitted; the socket is its owner's only",
 }
-
-
-def status_of(result: Any) -> PlayerStatus:
-    """A state as the player sent it, as a value; raises SourceError where it is not one."""
-    try:
-        streams = tuple(
-            StreamStatus(
-                str(stream["name"]),
-                int(stream["idcode"]),
-                bool(stream["enabled"]),
-                int(stream["clients"]),
-                {str(fate): int(count) for fate, count in stream["fates"].items()},
-                _pacing(stream["pacing"]),
-                {str(option): str(value) for option, value in stream["faults"].items()},
-            )
-            for stream in result["streams"]
-        )
-        between = result["between"]
-        return PlayerStatus(
-            PlayState(result["state"]),
-            _number(result["position_s"]),
-            _number(result["length_s"]),
-            int(result["loop"]),
-            _number(result["speed"]),
-            (_number(between[0]), _number(between[1])) if between else None,
-            _number(result["elapsed_s"]),
-            _number(result["frames_per_s"]),
-            int(result["sent"]),
-            _pacing(result["pacing"]),
-            streams,
-        )
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise SourceError(f"the player's answer is not understood ({error!r}); use the player's own version") from None
-
-
-def _pacing(said: Any) -> PacingStatus:
-    return PacingStatus(_number(said["p50_us"]), _number(said["p99_us"]), _number(said["max_us"]), int(said["misses"]))
-
-
-def _number(said: Any) -> float:
-    return float("nan") if said is None else float(said)

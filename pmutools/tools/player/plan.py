@@ -19,8 +19,8 @@ from pmutools import timebase
 from pmutools.errors import SettingsError
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Action
-from pmutools.impair.verbs import Place
 from pmutools.pacing import Playback
+from pmutools.parsers import Place
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.dress import dress

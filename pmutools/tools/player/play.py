@@ -18,7 +18,7 @@ from pmutools.impair.profile import STREAM_VERBS, Action, Profile
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.outlet import ServerEvent
 from pmutools.net.server import Senders
-from pmutools.pacing import LatenessSummary
+from pmutools.parsers import no_such_stream
 from pmutools.timebase import NS
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.delivery import Delivery
@@ -298,8 +298,6 @@ class Player:
 
         Before the play has begun, it is done at its beginning.
         """
-        if action.verb == "stats":
-            return
         if self._state is PlayState.ENDED:
             raise SettingsError("the play has ended")
         if action.verb == "step" and not (self._plan is not None and self._plan.paused):
@@ -321,8 +319,8 @@ class Player:
     def _meant(self, action: Action, parts: Sequence[int]) -> None:
         """Raise SettingsError for an order to streams that concerns none."""
         if action.rule is not None and not parts:
-            there = ", ".join(part.name for part in self.cast.parts[:20])
-            raise SettingsError(f"{action.verb} {', '.join(action.rule.patterns)}: no such stream; there are {there}")
+            asked = f"{action.verb} {', '.join(action.rule.patterns)}"
+            raise SettingsError(no_such_stream(asked, [part.name for part in self.cast.parts]))
 
     def status(self) -> PlayerStatus:
         """What it is doing now."""
@@ -340,7 +338,7 @@ class Player:
             max(elapsed_ns, 0) / NS,
             self._frames_per_s(),
             self.results.sent,
-            _pacing(self.results.lateness.summary()),
+            PacingStatus.of(self.results.lateness.summary()),
             _Statuses(self),
         )
 
@@ -352,7 +350,7 @@ class Player:
             self.pipelines[part].enabled,
             self.senders.audience(self.handles[part]),
             self.results.fates(part),
-            _pacing(self.results.lateness.summary(part)),
+            PacingStatus.of(self.results.lateness.summary(part)),
             dict(self.pipelines[part].stages.texts),
         )
 
@@ -397,7 +395,3 @@ def _sheet_ns(frames_per_s: float) -> int:
 def _offer(cast: Cast, part: int, edition: int) -> Served:
     config = cast.config(part, edition)
     return served(config, f"pmutools player, stream {config.idcode}")
-
-
-def _pacing(late: LatenessSummary) -> PacingStatus:
-    return PacingStatus(late.p50_ns / 1e3, late.p99_ns / 1e3, late.max_ns / 1e3, late.misses)

@@ -24,6 +24,7 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Flow
 from pmutools.formats.columns import unique
 from pmutools.formats.source import Block
+from pmutools.parsers import no_such_stream
 from pmutools.timebase import NS
 from pmutools.tools.window import FOREVER, Window
 
@@ -262,8 +263,8 @@ def _chosen(tracks: Sequence[Track], select: Collection[str], exclude: Collectio
     for option, wanted in (("--select", select), ("--exclude", exclude)):
         for name in wanted:
             if not any(name in track.names for track in tracks):
-                there = ", ".join(f"{track.name} ({track.config.idcode})" for track in tracks)
-                raise SettingsError(f"{option} {name}: no such stream; there are {there}")
+                there = [f"{track.name} ({track.config.idcode})" for track in tracks]
+                raise SettingsError(no_such_stream(f"{option} {name}", there))
     kept = [place for place, track in enumerate(tracks) if not select or any(name in select for name in track.names)]
     return [place for place in kept if not any(name in exclude for name in tracks[place].names)]
 

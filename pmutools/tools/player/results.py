@@ -14,6 +14,7 @@ from pmutools.pacing import Lateness, LatenessSummary
 from pmutools.timebase import NS
 from pmutools.tools.player.reel import I64
 from pmutools.tools.player.sheet import FATES, SENT
+from pmutools.tools.player.status import PacingStatus
 
 _AT_ONCE = 4096
 
@@ -28,13 +29,10 @@ class StreamResult:
     late: LatenessSummary
 
     def to_json(self) -> dict[str, Any]:
-        return {"name": self.name, "idcode": self.idcode, "fates": self.fates} | pacing_json(self.late)
-
-
-def pacing_json(late: LatenessSummary) -> dict[str, Any]:
-    """Pacing error in µs."""
-    times = {"p50": late.p50_ns / 1e3, "p99": late.p99_ns / 1e3, "max": late.max_ns / 1e3}
-    return {"late_us": times, "misses": late.misses}
+        pacing = PacingStatus.of(self.late)
+        late_us = {"p50": pacing.p50_us, "p99": pacing.p99_us, "max": pacing.max_us}
+        counts = {"name": self.name, "idcode": self.idcode, "fates": self.fates}
+        return counts | {"late_us": late_us, "misses": pacing.misses}
 
 
 class Results:
