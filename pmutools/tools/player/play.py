@@ -153,6 +153,7 @@ class Player:
             return
         for part, pipeline in enumerate(self.pipelines):
             pipeline.rehearse(int(self.cast.first_numbers[part]))
+        self.senders.announce()  # those of thousands take some 10 ms, so before the first deadline is set
         utc = utc_offset(clock)
         self._plan = plan = Plan(
             self.cast,
@@ -184,7 +185,6 @@ class Player:
             except SettingsError as error:
                 self._warn(f"{action.verb} {action.argument}: {error}")
         self._actions.clear()
-        self.senders.announce()
         going = self._run(plan, delivery, end_ns, self._watch(utc, progress))
         self._state = PlayState.ENDED
         if going and end_ns is None:
