@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pmutools import loglinear
+
 
 @dataclass(frozen=True, slots=True)
 class Playback:
@@ -64,27 +66,13 @@ class LatenessSummary(NamedTuple):
 
 
 _FRACTION_BITS = 5
-_LINEAR = 1 << _FRACTION_BITS + 1
 _BINS = 1024
 """Up to 63 ns one bin a nanosecond, then 32 bins an octave: the last bin begins at 67.6 s, and holds what is beyond."""
 
 
 def _bins(values_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """The bins of values (N,)."""
-    values = np.maximum(values_ns, 0)
-    shift = np.frexp(values.astype(np.float64))[1] - _FRACTION_BITS - 1  # bit length, exact below 2**53 ns
-    bins: npt.NDArray[np.int64] = np.where(
-        values < _LINEAR, values, (shift << _FRACTION_BITS) + (values >> np.maximum(shift, 0))
-    )
-    return np.minimum(bins, _BINS - 1)
-
-
-def _bin_edge(index: int) -> int:
-    """The largest value of a bin."""
-    if index < _LINEAR:
-        return index
-    shift = (index >> _FRACTION_BITS) - 1
-    return ((index - (shift << _FRACTION_BITS)) + 1 << shift) - 1
+    return np.minimum(loglinear.bins(np.maximum(values_ns, 0), _FRACTION_BITS), _BINS - 1)
 
 
 class Lateness:
@@ -124,4 +112,4 @@ def _percentile(bins: npt.NDArray[np.int64], percent: float, most_ns: int) -> in
     if not seen[-1]:
         return 0
     index = int(np.searchsorted(seen, max(percent / 100 * int(seen[-1]), 1)))
-    return min(_bin_edge(index), most_ns) if index < _BINS - 1 else most_ns
+    return min(loglinear.high(index, _FRACTION_BITS), most_ns) if index < _BINS - 1 else most_ns

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = [
     # ground floor, lowest first
-    ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws"],
+    ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws", "pmutools.loglinear"],
     ["pmutools.linux", "pmutools.parsers"],
     ["pmutools.clock", "pmutools.linux_columns", "pmutools.realtime", "pmutools.settings"],
     ["pmutools.pacing"],
@@ -51,12 +51,27 @@ CODEC = [
     "session",
 ]
 """Inside the codec, lowest first."""
-NO_CLOCK = ["pmutools.c37118", "pmutools.impair", "pmutools.grid", "pmutools.modal", "dcon.core", "dcon.limiter"]
+NO_CLOCK = [
+    "pmutools.c37118",
+    "pmutools.impair",
+    "pmutools.grid",
+    "pmutools.modal",
+    "pmutools.measure",
+    "dcon.core",
+    "dcon.limiter",
+]
 EDGES = {"time", "socket", "select", "selectors", "threading", "subprocess", "asyncio"}
 
 
 def test_packages_offer_what_they_have() -> None:
-    for name in ("pmutools.c37118", "pmutools.formats", "pmutools.impair", "pmutools.schema", "pmutools.net"):
+    for name in (
+        "pmutools.c37118",
+        "pmutools.formats",
+        "pmutools.impair",
+        "pmutools.schema",
+        "pmutools.net",
+        "pmutools.measure",
+    ):
         package = import_module(name)
         missing = [offered for offered in getattr(package, "__all__", ()) if not hasattr(package, offered)]
         assert not missing, f"{name} offers {missing}"

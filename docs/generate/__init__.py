@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import commands, controller, impairments, player, streams, structure, studies
+from generate import commands, controller, impairments, measures, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
@@ -12,6 +12,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     **impairments.GENERATORS,
     **player.GENERATORS,
     **controller.GENERATORS,
+    **measures.GENERATORS,
     **studies.GENERATORS,
     **commands.GENERATORS,
 }

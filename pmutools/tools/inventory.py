@@ -14,11 +14,9 @@ from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, FrameType, Stat
 from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.source import Block, Source
+from pmutools.measure.slots import OFF_GRID_SHARE
 from pmutools.tools.describe import describe_station
 from pmutools.tools.slots import SlotCounts
-
-OFF_GRID_SHARE = 0.1
-"""A stamp further than this share of a period from its reporting instant is off the grid."""
 
 
 @dataclass

@@ -1,0 +1,142 @@
+"""The least delay over time: what is left of a delay when no queue is in the way.
+
+The floor of a frame is the least delay of the last :data:`MEMORY` buckets and of its own up to it: delays above the
+floor (PDV, RFC 5481) are free of any constant offset between the clocks. The floor's course tells their skew from a
+step in latency.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from pmutools.measure.columns import Ints
+from pmutools.timebase import NS
+
+BUCKET_NS = 10 * NS
+MEMORY = 6
+POINTS = 512
+"""So many points of the course are kept; beyond, each two that are neighbours become one."""
+_ENOUGH = 6
+_NEVER = np.iinfo(np.int64).max
+
+
+class Skew(NamedTuple):
+    """A line through the floor. ``ppm`` > 0: the sender's clock loses against the receiver's."""
+
+    ppm: float
+    span_s: float
+    residual_ns: float
+    """Standard deviation of the floor about the line."""
+
+
+class Step(NamedTuple):
+    """A lasting change of the floor, by ``change_ns``, at ``at_ns`` (time of arrival)."""
+
+    change_ns: int
+    at_ns: int
+    noise_ns: float
+    """Standard deviation of the floor about its two levels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """The least delay (P,) of each stretch of time that begins at (P,)."""
+
+    start_ns: Ints
+    least_ns: Ints
+
+    def skew(self) -> Skew | None:
+        """The line of least squares; None for fewer than :data:`_ENOUGH` points."""
+        if len(self.start_ns) < _ENOUGH:
+            return None
+        seconds = (self.start_ns - self.start_ns[0]) / NS
+        off = (self.least_ns - self.least_ns[0]).astype(np.float64)
+        seconds_off = seconds - seconds.mean()
+        slope = float(seconds_off @ (off - off.mean()) / (seconds_off @ seconds_off))
+        residual = off - off.mean() - slope * seconds_off
+        return Skew(slope / 1000, float(seconds[-1]), float(residual.std()))
+
+    def step(self) -> Step | None:
+        """The split into two levels that leaves the least spread, each of three points or more."""
+        count = len(self.least_ns)
+        if count < _ENOUGH:
+            return None
+        off = (self.least_ns - self.least_ns[0]).astype(np.float64)
+        total, squares = np.cumsum(off), np.cumsum(off * off)
+        n = np.arange(3, count - 2)
+        left, right = total[n - 1], total[-1] - total[n - 1]
+        spread = squares[-1] - left**2 / n - right**2 / (count - n)
+        best = int(np.argmin(spread))
+        size = int(n[best])
+        change = right[best] / (count - size) - left[best] / size
+        noise = math.sqrt(max(0.0, float(spread[best])) / count)
+        return Step(round(float(change)), int(self.start_ns[size]), noise)
+
+
+class FloorMeter:
+    """Floors of frames in order of arrival, and the floor's course."""
+
+    def __init__(self) -> None:
+        self._bucket: int | None = None
+        self._least = _NEVER
+        self._last: list[tuple[int, int]] = []
+        """(bucket, least) of the last :data:`MEMORY` buckets before this one."""
+        self._course: list[tuple[int, int]] = []
+        self._width = 1
+
+    def restart(self) -> None:
+        """The delays that come next have nothing to do with those before; the course goes on."""
+        self._finish()
+        self._bucket, self._least, self._last = None, _NEVER, []
+
+    def add(self, arrival_ns: Ints, delay_ns: Ints) -> Ints:
+        """The floor (N,) of each frame (N,)."""
+        floor = np.empty_like(delay_ns)
+        buckets = arrival_ns // BUCKET_NS
+        cuts = [0, *(np.flatnonzero(np.diff(buckets)) + 1).tolist(), len(buckets)]
+        for first, end in pairwise(cuts):
+            if first == end:
+                continue
+            bucket = int(buckets[first])
+            if bucket != self._bucket:
+                self._finish()
+                self._last = [entry for entry in self._last if 0 < bucket - entry[0] <= MEMORY]
+                self._bucket, self._least = bucket, _NEVER
+            before = min((least for _, least in self._last), default=_NEVER)
+            here = floor[first:end]
+            np.minimum.accumulate(delay_ns[first:end], out=here)
+            np.minimum(here, min(before, self._least), out=here)
+            self._least = min(self._least, int(delay_ns[first:end].min()))
+        return floor
+
+    def _finish(self) -> None:
+        if self._bucket is None or self._least == _NEVER:
+            return
+        self._last.append((self._bucket, self._least))
+        _append(self._course, self._bucket - self._bucket % self._width, self._least)
+        while len(self._course) > POINTS:
+            self._width *= 2
+            merged: list[tuple[int, int]] = []
+            for bucket, least in self._course:
+                _append(merged, bucket - bucket % self._width, least)
+            self._course = merged
+
+    def course(self) -> Course:
+        """The floor so far."""
+        points = list(self._course)
+        if self._bucket is not None and self._least != _NEVER:
+            _append(points, self._bucket - self._bucket % self._width, self._least)
+        table = np.array(points, np.int64).reshape(-1, 2)
+        return Course(table[:, 0] * BUCKET_NS, table[:, 1])
+
+
+def _append(course: list[tuple[int, int]], bucket: int, least: int) -> None:
+    if course and course[-1][0] == bucket:
+        course[-1] = (bucket, min(course[-1][1], least))
+    else:
+        course.append((bucket, least))

@@ -1,0 +1,257 @@
+"""Quantiles of any number of durations in little memory: a signed log-linear histogram.
+
+Values are int64 nanoseconds, negative ones too: a delay below zero is a clock's error and must not be lost. Bins are
+1 µs wide to ±2.048 ms, then 1024 an octave, so that a quantile is wrong by at most 0.5 µs or 0.05 % of itself,
+whichever is more (:func:`error_ns`). Count, mean, standard deviation, least and largest are exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools import loglinear
+
+BITS = 10
+RESOLUTION_NS = 1000
+NS_PER_MS = 1e6
+PERCENTILES = {
+    "p1": 0.01,
+    "p5": 0.05,
+    "p25": 0.25,
+    "p50": 0.5,
+    "p75": 0.75,
+    "p90": 0.9,
+    "p95": 0.95,
+    "p99": 0.99,
+    "p99_9": 0.999,
+}
+"""Those that every distribution is told by, by the key they have in ``summary.json``."""
+_PAGE_BITS = 8
+_PAGE = 1 << _PAGE_BITS
+_NARROW = np.iinfo(np.uint32).max
+_DENSE = 1 << 14
+"""A batch that spans more bins is sorted rather than counted in an array."""
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bins:
+    """The bins that hold anything, in order: from ``low_ns`` up to below ``high_ns``, each (B,)."""
+
+    low_ns: Ints
+    high_ns: Ints
+    count: Ints
+
+    def __iter__(self) -> Iterator[tuple[int, int, int]]:
+        """(low, high, count) of each."""
+        return zip(self.low_ns.tolist(), self.high_ns.tolist(), self.count.tolist(), strict=True)
+
+
+def error_ns(value_ns: float) -> float:
+    """By how much a quantile that is told as ``value_ns`` may be wrong."""
+    return max(RESOLUTION_NS / 2, abs(value_ns) / (2 << BITS))
+
+
+class Histogram:
+    """How often each duration came. ``merge`` of two is the histogram of all their values, to the last count."""
+
+    __slots__ = ("_m2", "_mean", "_pages", "_type", "count", "max_ns", "min_ns")
+
+    def __init__(self, values_ns: npt.ArrayLike = ()) -> None:
+        self.count = 0
+        self.min_ns: int | None = None
+        self.max_ns: int | None = None
+        self._mean, self._m2 = 0.0, 0.0
+        self._pages: dict[int, npt.NDArray[Any]] = {}
+        self._type: type[np.integer[Any]] = np.uint32
+        self.add(np.asarray(values_ns, np.int64))
+
+    def add(self, values_ns: Ints) -> None:
+        """Count values (N,)."""
+        if not values_ns.size:
+            return
+        low, high = int(values_ns.min()), int(values_ns.max())
+        middle = low + (high - low) // 2
+        off = (values_ns - middle).astype(np.float64)
+        mean = float(off.mean())
+        off -= mean
+        self._combine(values_ns.size, middle + mean, float(off @ off), low, high)
+        indices = _indices(values_ns)
+        first, last = _index(low), _index(high)
+        if last - first < _DENSE:
+            base = first & -_PAGE
+            counts = np.bincount(indices - base, minlength=(last | _PAGE - 1) + 1 - base)
+            pages = counts.reshape(-1, _PAGE).astype(self._type)
+            for at in np.flatnonzero(pages.any(1)).tolist():
+                self._page((base >> _PAGE_BITS) + at)[...] += pages[at]
+            return
+        found, counts = np.unique(indices, return_counts=True)
+        for number in np.unique(found >> _PAGE_BITS).tolist():
+            here = found >> _PAGE_BITS == number
+            self._page(number)[found[here] & _PAGE - 1] += counts[here].astype(self._type)
+
+    def _page(self, number: int) -> npt.NDArray[Any]:
+        if (page := self._pages.get(number)) is None:
+            page = self._pages[number] = np.zeros(_PAGE, self._type)
+        return page
+
+    def _combine(self, count: int, mean: float, m2: float, low: int, high: int) -> None:
+        """Take in the moments of ``count`` more values (Chan, Golub and LeVeque 1979)."""
+        total = self.count + count
+        step = mean - self._mean if self.count else 0.0
+        self._m2 += m2 + step * step * (self.count * count / total)
+        self._mean = self._mean + step * (count / total) if self.count else mean
+        self.min_ns = low if self.min_ns is None else min(self.min_ns, low)
+        self.max_ns = high if self.max_ns is None else max(self.max_ns, high)
+        self.count = total
+        if total > _NARROW and self._type is np.uint32:  # half the memory, until then
+            self._type = np.int64
+            self._pages = {number: page.astype(np.int64) for number, page in self._pages.items()}
+
+    def merge(self, other: Histogram) -> None:
+        """Add all that ``other`` counted."""
+        if other.min_ns is None or other.max_ns is None:
+            return
+        self._combine(other.count, other._mean, other._m2, other.min_ns, other.max_ns)
+        for number, page in other._pages.items():
+            self._page(number)[...] += page.astype(self._type)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both counted the same in every bin; means may differ in their last bits."""
+        if not isinstance(other, Histogram):
+            return NotImplemented
+        return (self.count, self.min_ns, self.max_ns) == (other.count, other.min_ns, other.max_ns) and all(
+            np.array_equal(mine, others) for mine, others in zip(self._filled(), other._filled(), strict=True)
+        )
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    @property
+    def mean_ns(self) -> float | None:
+        return self._mean if self.count else None
+
+    @property
+    def sd_ns(self) -> float | None:
+        """Standard deviation of the population."""
+        return math.sqrt(self._m2 / self.count) if self.count else None
+
+    def bins(self) -> Bins:
+        """What is in the histogram."""
+        indices, counts = self._filled()
+        edges = np.array([_edges(index) for index in indices.tolist()], np.int64).reshape(-1, 2)
+        return Bins(edges[:, 0], edges[:, 1], counts)
+
+    def _filled(self) -> tuple[Ints, Ints]:
+        if not self._pages:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        numbers = sorted(self._pages)
+        counts = np.concatenate([self._pages[number] for number in numbers]).astype(np.int64)
+        indices = (np.array(numbers)[:, None] * _PAGE + np.arange(_PAGE)).reshape(-1)
+        filled = counts > 0
+        return indices[filled], counts[filled]
+
+    def quantile_ns(self, share: float, lost: int = 0) -> float | None:
+        """The smallest value that at least ``share`` of all do not exceed (the nearest rank, as in RFC 2330).
+
+        ``lost`` frames rank behind all others with an infinite delay, as RFC 7679 has it: then infinity is an answer.
+        None of nothing.
+        """
+        return self.quantiles_ns((share,), lost)[0]
+
+    def quantiles_ns(self, shares: tuple[float, ...], lost: int = 0) -> list[float | None]:
+        """:meth:`quantile_ns` of several shares."""
+        if not self.count + lost:
+            return [None] * len(shares)
+        indices, counts = self._filled()
+        seen = np.cumsum(counts)
+        found: list[float | None] = []
+        for share in shares:
+            rank = max(1, math.ceil(share * (self.count + lost) - 1e-9))
+            if rank > self.count:
+                found.append(math.inf)
+            elif rank == 1:
+                found.append(self.min_ns)
+            elif rank == self.count:
+                found.append(self.max_ns)
+            else:
+                found.append(self._middle_ns(int(indices[np.searchsorted(seen, rank)])))
+        return found
+
+    def _middle_ns(self, index: int) -> float:
+        assert self.min_ns is not None and self.max_ns is not None
+        low, high = _edges(index)
+        return min(max((low + high) // 2, self.min_ns), self.max_ns)
+
+    def at_most(self, value_ns: float) -> float:
+        """How many values do not exceed ``value_ns``; within its bin, in proportion."""
+        return float(self.at_most_array(np.array([value_ns]))[0])
+
+    def at_most_array(self, values_ns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """:meth:`at_most` of values (V,)."""
+        if self.min_ns is None or self.max_ns is None:
+            return np.zeros(len(values_ns))
+        bins = self.bins()
+        low, high, count = bins.low_ns, bins.high_ns, bins.count
+        edges = np.stack((np.maximum(low, self.min_ns), np.minimum(high, self.max_ns)), 1).reshape(-1)
+        seen = np.stack((np.cumsum(count) - count, np.cumsum(count)), 1).reshape(-1)
+        found = np.interp(values_ns, edges, seen, left=0.0)
+        return np.where(values_ns >= self.max_ns, self.count, np.where(values_ns < self.min_ns, 0.0, found))
+
+    def summary_ms(self, lost: int | None = None) -> dict[str, float | int | None]:
+        """Count, mean, sd, least, percentiles and largest in ms, by the keys of ``summary.json``.
+
+        With ``lost``, also percentiles among all that were expected, as ``p99_expected``; null where infinite.
+        """
+        found = dict(zip(PERCENTILES, self.quantiles_ns(tuple(PERCENTILES.values())), strict=True))
+        told: dict[str, float | int | None] = {
+            "mean": ms(self.mean_ns),
+            "sd": ms(self.sd_ns),
+            "min": ms(self.min_ns),
+            **{key: ms(value) for key, value in found.items()},
+            "max": ms(self.max_ns),
+            "count": self.count,
+        }
+        if lost is not None:
+            ranked = zip(PERCENTILES, self.quantiles_ns(tuple(PERCENTILES.values()), lost), strict=True)
+            told |= {f"{key}_expected": ms(value) for key, value in ranked}
+        return told
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it: the bins as [low ms, high ms, count]."""
+        return {"count": self.count, "bins": [[low / NS_PER_MS, high / NS_PER_MS, n] for low, high, n in self.bins()]}
+
+
+def ms(value_ns: float | None) -> float | None:
+    """Milliseconds of a number that JSON can hold: null where there is none, or no end."""
+    return None if value_ns is None or not math.isfinite(value_ns) else value_ns / NS_PER_MS
+
+
+def _indices(values_ns: Ints) -> Ints:
+    """Signed bins: 0 is what rounds to 0 µs, and bins ±i are alike."""
+    size = np.abs(values_ns)
+    size += RESOLUTION_NS // 2
+    size //= RESOLUTION_NS
+    found = loglinear.bins(size, BITS)
+    if values_ns.min() < 0:
+        found = np.where(values_ns < 0, -found, found)
+    return found
+
+
+def _index(value_ns: int) -> int:
+    """:func:`_indices` of one value."""
+    index = loglinear.bin_of((abs(value_ns) + RESOLUTION_NS // 2) // RESOLUTION_NS, BITS)
+    return index if value_ns >= 0 else -index
+
+
+def _edges(index: int) -> tuple[int, int]:
+    """Lower and upper edge of a bin in ns."""
+    low, high = loglinear.low(abs(index), BITS), loglinear.high(abs(index), BITS)
+    near, far = low * RESOLUTION_NS - RESOLUTION_NS // 2, high * RESOLUTION_NS + RESOLUTION_NS // 2
+    return (near, far) if index >= 0 else (-far, -near)

@@ -1,0 +1,347 @@
+"""All that is measured of one stream: batches in order of arrival go in, counts come out."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+from enum import StrEnum
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pmutools import timebase
+from pmutools.c37118.batch import NO_TIME, Batch
+from pmutools.c37118.config import StreamConfig
+from pmutools.measure.columns import Frames, Ints, any_station, frames_of, joined
+from pmutools.measure.counts import Counts
+from pmutools.measure.delay import DelayCounts, DelayMeter
+from pmutools.measure.floor import Course
+from pmutools.measure.quality import Events, QualityCounts, QualityMeter
+from pmutools.measure.sequence import LossCounts, LossMeter, OrderCounts, OrderMeter
+from pmutools.measure.slots import HORIZON_S, OFF_GRID_SHARE, Intake, Placed, Ring, SlotCounts, Verdict
+from pmutools.measure.windows import WindowCounts, WindowMeter
+
+WAIT_NS = 200_000_000
+"""A concentrator's customary wait: what comes later is late."""
+SILENCE_NS = 10 * timebase.NS
+"""Arrivals further apart than this are a silence to remember."""
+SILENCES = 32
+_LONGEST_REACH = 1 << 15
+GATHER = 512
+"""So many frames are counted at once where batches are small."""
+
+
+class Identity(NamedTuple):
+    """Which stream it is."""
+
+    name: str
+    idcode: int
+    transport: str = ""
+    multicast: bool = False
+
+
+class Silence(NamedTuple):
+    """Nothing came for ``length_ns``, from ``after_ns`` after the first arrival on."""
+
+    after_ns: int
+    length_ns: int
+
+
+@dataclass
+class StreamCounts(Counts):
+    """What is counted of a stream; the counts of an interval add up to those of the run."""
+
+    slots: SlotCounts = field(default_factory=SlotCounts)
+    order: OrderCounts = field(default_factory=OrderCounts)
+    losses: LossCounts = field(default_factory=LossCounts)
+    delays: DelayCounts = field(default_factory=DelayCounts)
+    windows: WindowCounts = field(default_factory=WindowCounts)
+    quality: QualityCounts = field(default_factory=QualityCounts)
+    events: Events = field(default_factory=Events)
+
+
+@dataclass(frozen=True)
+class StreamResult:
+    """A stream's counts with what does not add up: its identity, its times, the course of its floor."""
+
+    identity: Identity
+    config: StreamConfig
+    counts: StreamCounts
+    rate: Fraction
+    """Frames/s by the configuration; 0 where that names none."""
+    wait_ns: int
+    horizon_ns: int
+    """Tmax: what comes later is lost, and stale when it comes."""
+    first_ns: int | None
+    """Time stamp of the first frame in order of arrival, and of the last."""
+    last_ns: int | None
+    first_arrival_ns: int | None
+    last_arrival_ns: int | None
+    silences: tuple[Silence, ...]
+    course: Course
+    end_ns: int | None = None
+    """When the measurement ended."""
+
+    @property
+    def period_ns(self) -> float:
+        return timebase.NS / float(self.rate) if self.rate else 0.0
+
+    @property
+    def silent_ns(self) -> int:
+        """Since the last arrival, at the end: not loss."""
+        if self.end_ns is None or self.last_arrival_ns is None:
+            return 0
+        return max(0, self.end_ns - self.last_arrival_ns)
+
+
+class State(StrEnum):
+    """What became of a frame, the gravest that applies."""
+
+    ON_TIME = "on-time"
+    OFF_GRID = "off-grid"
+    REORDERED = "reordered"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+    CONFLICTING = "conflicting"
+    STALE = "stale"
+    LOST = "lost"
+
+
+STATES = tuple(State)
+_FIRSTS = STATES.index(State.LATE)
+
+
+class Seen(NamedTuple):
+    """Frames (N,) that were counted, in order of arrival, and slots (L,) found to be lost meanwhile.
+
+    The slots of an outage are lost, too, but are not listed.
+    """
+
+    slot: Ints
+    time_ns: Ints
+    arrival_ns: Ints
+    delay_ns: Ints
+    stamp_source: npt.NDArray[np.uint8]
+    state: npt.NDArray[np.uint8]
+    """(N,) index into :data:`STATES`."""
+    lost: Ints
+
+    def unique(self) -> tuple[Ints, Ints]:
+        """Slots and arrivals of the frames that were the first of their slots: what an alignment of streams takes."""
+        first = self.state <= _FIRSTS
+        return (self.slot, self.arrival_ns) if first.all() else (self.slot[first], self.arrival_ns[first])
+
+
+class StreamMeter:
+    """Measures one stream in constant memory: some 300 KiB, half as much again where intervals are taken.
+
+    Frames of small batches are gathered, ``gather`` of them, before most of it is counted; :meth:`drain` does so at
+    once, and :meth:`result` tells of all in any case.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        config: StreamConfig,
+        *,
+        wait_ns: int = WAIT_NS,
+        horizon_s: float = HORIZON_S,
+        phase_ns: int = 0,
+        gather: int = GATHER,
+    ) -> None:
+        self.identity, self.config = identity, config
+        self._horizon_ns = round(horizon_s * timebase.NS)
+        self._counts = StreamCounts()
+        self._total = StreamCounts()
+        self._losses, self._quality = LossMeter(), QualityMeter()
+        self._windows = WindowMeter(config.rate, phase_ns)
+        self._first_ns: int | None = None
+        self._last_ns: int | None = None
+        self._first_arrival_ns: int | None = None
+        self._last_arrival_ns: int | None = None
+        self._silences: list[Silence] = []
+        self._counted, self._gather = 0, gather
+        self._gathered: list[Frames] = []
+        self._regrid()
+        self._delays = DelayMeter(self._period_ns, wait_ns)
+        self._begin_counts()
+
+    @property
+    def events(self) -> Events:
+        """What happened around the frames: for the receiver to count up."""
+        return self._counts.events
+
+    def _regrid(self) -> None:
+        """Slots by the configuration's rate."""
+        self._rate = self.config.rate
+        self._period_ns = timebase.NS / float(self._rate) if self._rate else timebase.NS
+        reach = int(self._horizon_ns / self._period_ns)
+        self._reach = min(max(reach, 16), _LONGEST_REACH)
+        self._intake, self._ring = Intake(self._reach, self._period_ns), Ring(self._reach)
+        self._order = OrderMeter(self._reach)
+
+    def _begin_counts(self) -> None:
+        counts = self._counts
+        self._order.counts, self._losses.counts = counts.order, counts.losses
+        self._delays.counts, self._windows.counts = counts.delays, counts.windows
+        self._quality.counts = counts.quality
+
+    def add(self, batch: Batch) -> list[Seen]:
+        """Measure a batch that came after all before it; the frames counted by now, in parts."""
+        if not len(batch):
+            return []
+        found = []
+        if batch.config is not self.config and batch.config != self.config:
+            found = self._reconfigure(batch.config)
+        stat = any_station(batch.stat)
+        frames = frames_of(batch, stat, self._rate, self._counted)
+        self._counted += len(batch)
+        self._quality.add(batch, stat, frames.synchronised)
+        slots = self._counts.slots
+        slots.frames += len(batch)
+        limit_ns = OFF_GRID_SHARE * self._period_ns
+        slots.off_grid += int(np.count_nonzero(np.abs(frames.off_grid_ns) > limit_ns))
+        self._note_times(frames)
+        self._gathered.append(frames)
+        return found + (self.drain() if sum(map(len, self._gathered)) >= self._gather else [])
+
+    def drain(self) -> list[Seen]:
+        """Count the frames gathered so far, and tell of them."""
+        if not self._gathered:
+            return []
+        frames, self._gathered = joined(self._gathered), []
+        return [seen for verdict, part in self._intake.feed(frames) for seen in self._take(verdict, part)]
+
+    def _reconfigure(self, config: StreamConfig) -> list[Seen]:
+        rate = self.config.rate
+        self.config = config
+        if config.rate == rate:
+            return []
+        found = self.drain() + self._flush()
+        self._losses.restart()
+        self._regrid()
+        self._order.counts = self._counts.order
+        self._windows.restart(self._rate)
+        self._delays.restart(self._period_ns)
+        return found
+
+    def _flush(self) -> list[Seen]:
+        """Settle all that is still open."""
+        found = [seen for verdict, part in self._intake.flush() for seen in self._take(verdict, part)]
+        rest = self._ring.rest()
+        self._losses.add(rest.received)
+        self._losses.close()
+        nothing = np.zeros(0, np.int64)
+        none = np.zeros(0, np.uint8)
+        return [*found, Seen(nothing, nothing, nothing, nothing, none, none, rest.lost)]
+
+    def _note_times(self, frames: Frames) -> None:
+        if self._first_ns is None:
+            self._first_ns = int(frames.time_ns[0])
+        self._last_ns = int(frames.time_ns[-1])
+        arrivals = frames.arrival_ns
+        if (unknown := arrivals == NO_TIME).any():
+            arrivals = arrivals[~unknown]
+        if not len(arrivals):
+            return
+        if self._first_arrival_ns is None:
+            self._first_arrival_ns = int(arrivals[0])
+        before = self._last_arrival_ns
+        gaps = np.diff(arrivals) if before is None else np.diff(arrivals, prepend=before)
+        if gaps.size and int(gaps.max()) >= SILENCE_NS:
+            starts = arrivals[:-1] if before is None else np.concatenate(([before], arrivals[:-1]))
+            for at in np.flatnonzero(gaps >= SILENCE_NS).tolist():
+                self._silences.append(Silence(int(starts[at]) - self._first_arrival_ns, int(gaps[at])))
+            if len(self._silences) > SILENCES:  # the first one tells most; of the others, the longest
+                rest = sorted(self._silences[1:], key=lambda silence: -silence.length_ns)[: SILENCES - 1]
+                self._silences = [self._silences[0], *sorted(rest)]
+        self._last_arrival_ns = int(arrivals[-1])
+
+    def _take(self, verdict: Verdict, part: Frames) -> list[Seen]:
+        slots = self._counts.slots
+        found: list[Seen] = []
+        lost = np.zeros(0, np.int64)
+        if verdict is Verdict.STALE:
+            slots.stale += len(part)
+            return [_seen(part, np.full(len(part), STATES.index(State.STALE), np.uint8), lost)]
+        if verdict is Verdict.RESTART:
+            rest = self._ring.rest()
+            lost = rest.lost
+            self._losses.add(rest.received)
+            self._losses.restart()
+            self._ring.restart(int(part.slot[0]))
+            self._order.restart()
+            self._delays.restart(self._period_ns)
+            slots.epochs += 1
+        elif verdict is Verdict.OUTAGE:
+            slots.outages += 1
+            rest, gone = self._ring.skip(int(part.slot[0]), slots)
+            lost = rest.lost
+            self._losses.add(rest.received)
+            self._losses.add_lost(gone)
+        pieces, befores, changes = [], [], []
+        for rows, placed, settled in self._ring.place(part, slots):
+            self._losses.add(settled.received)
+            piece, before = part[rows], placed.before
+            found.append(_seen(piece, self._states(piece, placed), np.concatenate((lost, settled.lost))))
+            lost = lost[:0]
+            if not placed.first.all():
+                piece, before = piece[placed.first], before[placed.first]
+            pieces.append(piece)
+            befores.append(before)
+            changes.append(placed.ipdv_ns)
+        firsts = joined(pieces)
+        self._order.add(firsts.slot, np.concatenate(befores), firsts.arrival_ns)
+        self._delays.add(firsts, np.concatenate(changes))
+        unseen = firsts.arrival_ns == NO_TIME
+        self._windows.add(firsts.arrival_ns[~unseen] if unseen.any() else firsts.arrival_ns)
+        return found
+
+    def _states(self, frames: Frames, placed: Placed) -> npt.NDArray[np.uint8]:
+        """(N,) the gravest state of each frame."""
+        state = np.zeros(len(frames), np.uint8)
+        state[np.abs(frames.off_grid_ns) > OFF_GRID_SHARE * self._period_ns] = STATES.index(State.OFF_GRID)
+        state[frames.slot < placed.before] = STATES.index(State.REORDERED)
+        state[frames.delay_ns > self._delays.wait_ns] = STATES.index(State.LATE)
+        if not placed.first.all():
+            state[~placed.first] = STATES.index(State.STALE)
+            if placed.again is not None and placed.conflicting is not None:
+                state[placed.again] = STATES.index(State.DUPLICATE)
+                state[placed.conflicting] = STATES.index(State.CONFLICTING)
+        return state
+
+    def take_interval(self) -> StreamCounts:
+        """The counts since the last interval; what is gathered, or open (a loss period, a window) goes to the next."""
+        counts, self._counts = self._counts, StreamCounts()
+        self._total.merge(counts)
+        self._begin_counts()
+        return counts
+
+    def result(self, end_ns: int | None = None) -> StreamResult:
+        """All so far, as if the stream ended here (``end_ns``: now, in the receiver's time). It may go on after."""
+        open_ = deepcopy(self, {id(self.config): self.config, id(self._quality._config): self._quality._config})
+        open_.drain()
+        open_._flush()
+        open_._windows.close()
+        open_.take_interval()
+        return StreamResult(
+            self.identity,
+            self.config,
+            open_._total,
+            self._rate,
+            self._delays.wait_ns,
+            round(self._reach * self._period_ns),
+            self._first_ns,
+            self._last_ns,
+            self._first_arrival_ns,
+            self._last_arrival_ns,
+            tuple(self._silences),
+            open_._delays.floor.course(),
+            end_ns,
+        )
+
+
+def _seen(frames: Frames, state: npt.NDArray[np.uint8], lost: Ints) -> Seen:
+    return Seen(frames.slot, frames.time_ns, frames.arrival_ns, frames.delay_ns, frames.stamp_source, state, lost)

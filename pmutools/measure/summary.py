@@ -1,0 +1,185 @@
+"""``summary.json``: everything that was measured, under the names that scripts hold on to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pmutools import timebase
+from pmutools.measure.budget import budget
+from pmutools.measure.clockquality import ClockLog
+from pmutools.measure.completeness import Alignment, curve
+from pmutools.measure.diagnoses import Scene, diagnose
+from pmutools.measure.fits import best_fit, typical
+from pmutools.measure.histogram import Histogram, ms
+from pmutools.measure.stream import StreamCounts, StreamResult
+from pmutools.measure.uncertainty import uncertainty
+
+
+def summary(
+    results: Sequence[StreamResult], clock: ClockLog, alignments: Sequence[Alignment] = (), *, fits: bool = True
+) -> dict[str, Any]:
+    """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed. A fit takes some 50 ms."""
+    streams = [stream_summary(result, clock, results, fit=fits) for result in results]
+    return _safe({"clock": clock.to_json(), "streams": streams, "all": _all(results, alignments)})
+
+
+def stream_summary(
+    result: StreamResult, clock: ClockLog, others: Sequence[StreamResult] = (), *, fit: bool = True
+) -> dict[str, Any]:
+    """One stream's part."""
+    counts, identity = result.counts, result.identity
+    sure = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns)
+    locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
+    fitted_to, of = typical(counts.delays)
+    fitted = best_fit(fitted_to) if fit else None
+    skew = result.course.skew()
+    names = [station.name for station in result.config.stations]
+    diagnoses = diagnose(Scene(result, clock, others or (result,)))
+    return _safe(
+        {
+            "name": identity.name,
+            "idcode": identity.idcode,
+            "transport": identity.transport,
+            "rate_hz": float(result.rate),
+            **_counted(counts),
+            "silent_s": result.silent_ns / timebase.NS,
+            "own_drops": counts.events.own_drops,
+            **_delays(counts, sure.bound_ns),
+            "loss_runs": counts.losses.to_json(result.period_ns),
+            "reordering": counts.order.to_json(),
+            "per_window": counts.windows.to_json(),
+            "completeness_vs_wait": curve(counts.delays.delay, counts.slots.expected),
+            "quality": counts.quality.to_json(counts.slots.expected, counts.slots.received, names),
+            "fit": {**fitted.to_json(), "of": of} if fitted else None,
+            "diagnoses": [diagnosis._asdict() for diagnosis in diagnoses],
+            # what follows is beyond the agreed keys
+            **_more(counts),
+            "wait_ms": ms(result.wait_ns),
+            "tmax_s": result.horizon_ns / timebase.NS,
+            "uncertainty": sure.to_json(),
+            "uncertainty_locked_ms": ms(locked.bound_ns),
+            "skew_ppm": skew.ppm if skew else None,
+            "floor": [
+                [start_ns, ms(least)]
+                for start_ns, least in zip(
+                    result.course.start_ns.tolist(), result.course.least_ns.tolist(), strict=True
+                )
+            ],
+            "silences": [
+                {"after_s": silence.after_ns / timebase.NS, "length_s": silence.length_ns / timebase.NS}
+                for silence in result.silences
+            ],
+            "first": _utc(result.first_ns),
+            "last": _utc(result.last_ns),
+            "budget": [row.to_json() for row in budget(counts.delays.delay, counts.delays.pdv, counts.windows.to_tick)],
+        }
+    )
+
+
+def interval_summary(counts: StreamCounts) -> dict[str, Any]:
+    """What was counted in an interval; the delays' percentiles, without fits and diagnoses."""
+    own = {"own_drops": counts.events.own_drops, "per_window": counts.windows.to_json()}
+    return _safe({**_counted(counts), **own, **_delays(counts, None)})
+
+
+def _counted(counts: StreamCounts) -> dict[str, Any]:
+    slots = counts.slots
+    return {
+        "expected": slots.expected,
+        "received": slots.received,
+        "lost": slots.lost,
+        "duplicated": slots.duplicated,
+        "reordered": counts.order.reordered,
+        "corrupt": counts.events.corrupt,
+        "late": counts.delays.late,
+        "off_grid": slots.off_grid,
+    }
+
+
+def _delays(counts: StreamCounts, bound_ns: int | None) -> dict[str, Any]:
+    delays = counts.delays
+    return {
+        "delay_ms": delays.delay.summary_ms(counts.slots.lost),
+        "delay_locked_ms": delays.locked.summary_ms(),
+        "uncertainty_ms": ms(bound_ns),
+        "interarrival_ms": delays.interarrival.summary_ms(),
+        "ipdv_ms": delays.ipdv.summary_ms(),
+        "pdv_ms": delays.pdv.summary_ms(),
+        "jitter_rfc3550_ms": ms(delays.jitter_ns) if delays.interarrival.count else None,
+    }
+
+
+def _more(counts: StreamCounts) -> dict[str, Any]:
+    slots, delays, windows = counts.slots, counts.delays, counts.windows
+    received = slots.received or None
+    return {
+        "frames": slots.frames,
+        "stale": slots.stale,
+        "conflicting": slots.conflicting,
+        "replicated_share": slots.replicated / received if received else None,
+        "epochs": slots.epochs,
+        "outages": slots.outages,
+        "negative": delays.negative,
+        "bursts": delays.bursts,
+        "delay_unlocked_ms": delays.unlocked.summary_ms(),
+        "owamp_jitter_ms": ms(delays.owamp_jitter_ns),
+        "windows": {
+            "most": windows.most,
+            "empty_runs": windows.empty_runs.to_json(),
+            "to_tick_ms": windows.to_tick.summary_ms(),
+        },
+        "events": counts.events.to_json(),
+    }
+
+
+def _all(results: Sequence[StreamResult], alignments: Sequence[Alignment]) -> dict[str, Any]:
+    """All streams together: sums, one distribution of all delays, and the alignment of stamps."""
+    counts = StreamCounts()
+    for result in results:
+        counts.merge(result.counts)
+    counts.delays.jitter_ns = max((result.counts.delays.jitter_ns for result in results), default=0.0)
+    together = [alignment.to_json() for alignment in alignments]
+    expected = counts.slots.expected
+    return {
+        "streams": len(results),
+        **_counted(counts),
+        "silent_s": max((result.silent_ns for result in results), default=0) / timebase.NS,
+        # of one socket, and so the same drops, where several streams came by it
+        "own_drops": counts.events.own_drops,
+        **_delays(counts, None),
+        "per_window": counts.windows.to_json(),
+        "completeness_vs_wait": together[0]["completeness_vs_wait"] if len(together) == 1 else _curve(counts, expected),
+        "quality": counts.quality.to_json(expected, counts.slots.received),
+        "alignment": together,
+        **_more(counts),
+    }
+
+
+def _curve(counts: StreamCounts, expected: int) -> list[list[float]]:
+    delays: Histogram = counts.delays.delay
+    return curve(delays, expected)
+
+
+def _utc(time_ns: int | None) -> str | None:
+    """ISO-8601; None for no time, and for one that no calendar has."""
+    try:
+        return None if time_ns is None else timebase.format_utc(time_ns)
+    except OverflowError:
+        return None
+
+
+def _safe(told: dict[str, Any]) -> dict[str, Any]:
+    """JSON has neither infinity nor NaN, and keys are text."""
+    return {str(key): _safe_value(value) for key, value in told.items()}
+
+
+def _safe_value(value: Any) -> Any:
+    if isinstance(value, dict):
+        return _safe(value)
+    if isinstance(value, list | tuple):
+        return [_safe_value(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

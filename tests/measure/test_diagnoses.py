@@ -1,0 +1,197 @@
+"""Each diagnosis: a stream that it must be made of, and ones that it must not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.measured import MS, START_NS, arranged, batch, config, measured, stamps
+
+from pmutools.flow import StampSource
+from pmutools.measure.clockquality import ClockLog, ClockQuality, KernelClock
+from pmutools.measure.diagnoses import ROWS, Scene, diagnose
+from pmutools.measure.stream import Identity, StreamResult
+from pmutools.timebase import NS
+
+RNG = np.random.default_rng(11)
+GOOD = KernelClock(0, 0.0, 200, 100, 0x2001)
+TCP, MULTICAST = Identity("N1", 101, "tcp"), Identity("N1", 101, "udp", multicast=True)
+COUNT = 12_000
+
+
+def clock(kernel: KernelClock = GOOD, step_ns: int = 0) -> ClockLog:
+    log = ClockLog()
+    log.add(ClockQuality(kernel))
+    if step_ns:
+        log.stepped(step_ns)
+    return log
+
+
+def noise(count: int = COUNT, mean_ms: float = 1.0) -> np.ndarray:
+    """A floor and a tail above it."""
+    return np.random.default_rng(count).exponential(mean_ms, count)
+
+
+def stream(count: int = COUNT, delay_ms: Any = 44.0, *, rate: int = 60, **options: Any) -> StreamResult:
+    keys = ("identity", "end_ns", "wait_ns")
+    of_meter = {key: options.pop(key) for key in keys if key in options}
+    of = options.pop("of", config(rate))
+    instants = options.pop("time_ns", None)
+    times = stamps(range(count), rate) if instants is None else instants
+    return measured(arranged(batch(times, delay_ms + noise(len(times)), of=of, **options)), **of_meter)
+
+
+def slots(chosen: Any, **options: Any) -> StreamResult:
+    return stream(time_ns=stamps(np.asarray(chosen).tolist()), **options)
+
+
+def with_events(**counted: Any) -> StreamResult:
+    result = stream()
+    for name, value in counted.items():
+        setattr(result.counts.events, name, value)
+    return result
+
+
+def silent_after(seconds: float) -> StreamResult:
+    count = int(seconds * 60)
+    return stream(count, identity=MULTICAST, end_ns=START_NS + round((seconds + 120) * NS))
+
+
+def repeated() -> StreamResult:
+    """An inserted leap second, on both clocks: a second of stamps and arrivals comes twice."""
+    instants = np.append(np.arange(6000), np.arange(5940, 12_000))
+    return measured(batch(stamps(instants.tolist()), 44.0, values=np.arange(12_060), time_quality=0x20))
+
+
+def leapt(by_s: float = 1.0) -> StreamResult:
+    """A leap second that the sender's stamps do not follow for a while."""
+    times = stamps(range(COUNT))
+    delay = 44 + noise() + np.where((np.arange(COUNT) > 6000) & (np.arange(COUNT) < 6600), by_s * 1000, 0)
+    return measured(batch(times, delay))
+
+
+HEALTHY: dict[str, Scene] = {
+    "plain": Scene(stream(), clock()),
+    "tcp": Scene(stream(identity=TCP), clock()),
+    "some loss": Scene(slots(np.flatnonzero(RNG.random(COUNT) > 0.01)), clock()),
+    "some copies": Scene(slots(np.sort(np.append(np.arange(COUNT), np.arange(0, COUNT, 20)))), clock()),
+    "heavy tail": Scene(
+        measured(arranged(batch(stamps(range(COUNT)), 44 + RNG.pareto(3, COUNT) * 3), )), clock()
+    ),
+    "slow": Scene(stream(rate=10), clock()),
+    "short": Scene(stream(20), clock()),
+    "no arrivals": Scene(measured(batch(stamps(range(600)), None)), clock()),
+    "a PMU alone at two rates": Scene(stream(), clock(), (stream(), stream(rate=30))),
+}  # fmt: skip
+
+sawtooth = np.where(np.arange(COUNT) % 2 == 0, 16.0, 0.0)
+at_30 = stream(rate=30, delay_ms=1.5 * 1000 / 30)
+SICK: dict[str, tuple[Scene, str]] = {
+    "receiver-clock": (Scene(stream(), clock(replace(GOOD, status=0x40))), "not disciplined"),
+    "receiver-clock set": (Scene(stream(), clock(step_ns=5 * MS)), "set 1 time"),
+    "negative-delays": (Scene(stream(delay_ms=-3.0), clock()), "down to -3 ms"),
+    "tai-utc": (Scene(stream(delay_ms=-37_000 + 44.0), clock()), "the sender's stamps run on TAI"),
+    "tai-utc receiver": (Scene(stream(delay_ms=37_000 + 44.0), clock()), "the receiver's clock"),
+    "tai-utc gps": (Scene(stream(delay_ms=-18_000 + 44.0), clock()), "GPS time is 18 s"),
+    "locked-but-off": (Scene(stream(delay_ms=4.8 * 86_400_000), clock()), "4.8 days behind"),
+    "locked-but-off ahead": (Scene(stream(delay_ms=-29_000), clock()), "29.0 s ahead"),
+    "unsynchronised": (Scene(stream(stat=0x21F0, time_quality=0xF), clock()), "100%"),
+    "leap-second": (Scene(leapt(), clock()), "2 time(s)"),
+    "leap-second repeated": (
+        Scene(repeated(), clock()),
+        "stamps came twice",
+    ),
+    "clock-skew": (
+        Scene(stream(delay_ms=44 + np.arange(COUNT) / 60 * 0.05), clock()),
+        "+50.",
+    ),
+    "latency-step": (
+        Scene(measured(arranged(batch(stamps(range(COUNT)), 44 + noise() + 8.0 * (np.arange(COUNT) > 7000)))), clock()),
+        "+8",
+    ),
+    "delay-of-a-period": (
+        Scene(measured(batch(stamps(range(COUNT)), 1000 / 60 + noise(mean_ms=0.1))), clock()),
+        "one reporting period",
+    ),
+    "delay-of-a-period everywhere": (
+        Scene(stream(delay_ms=1.5 * 1000 / 60), clock(), (stream(delay_ms=1.5 * 1000 / 60), at_30)),
+        "grows with 1/Fs",
+    ),
+    "stale-frames": (
+        Scene(
+            measured(
+                batch(
+                    np.concatenate((stamps([0, 1]) - 63 * 86_400 * NS, stamps(range(600)))),
+                    np.concatenate(([63 * 86_400_000.0] * 2, 44 + np.arange(600) % 7 * 0.1)),
+                )
+            ),
+            clock(),
+        ),
+        "2 frame(s) were stale",
+    ),
+    "rate-mismatch": (Scene(slots(np.arange(0, COUNT, 2)), clock()), "sends 30/s, its configuration says 60/s"),
+    "rate-mismatch faster": (
+        Scene(stream(time_ns=stamps(range(COUNT), 100), values=np.arange(COUNT)), clock()),
+        "sends about 100 frames/s",
+    ),
+    "rate-mismatch none": (Scene(stream(of=config(0)), clock()), "names no rate"),
+    "off-grid": (Scene(stream(time_ns=stamps(range(COUNT)) + RNG.integers(0, 8 * MS, COUNT)), clock()), "%"),
+    "two-senders": (Scene(slots(np.repeat(np.arange(COUNT), 2)), clock()), "byte for byte the same"),
+    "own-drops": (Scene(with_events(own_drops=96), clock()), "dropped 96 datagrams"),
+    "host-stalls": (Scene(with_events(stalls=3, longest_stall_ms=80.0), clock()), "3 time(s), for up to 80 ms"),
+    "multicast-ageing": (Scene(silent_after(260), clock()), "silent 260 s"),
+    "tcp-batching": (Scene(stream(source=StampSource.KERNEL_BATCHED), clock()), "100%"),
+    "tcp-batching bursts": (Scene(stream(identity=TCP, delay_ms=44 + sawtooth), clock()), "Nagle"),
+    "coarse-stamps": (
+        Scene(measured(batch(stamps(range(0, 60_000, 60)), 20.0 + np.arange(1000) % 5)), clock()),
+        "whole multiples of 1 ms",
+    ),
+    "coarse-stamps base": (Scene(stream(of=replace(config(), time_base=1000)), clock()), "told to 1 ms"),
+    "uneven-arrival": (Scene(stream(delay_ms=44 + sawtooth), clock()), "arrival is uneven"),
+    "late-frames": (Scene(stream(delay_ms=199.0, wait_ns=200 * MS), clock()), "99.9 %"),
+}
+
+
+@pytest.mark.parametrize("case", SICK)
+def test_made_of_what_has_it(case: str) -> None:
+    scene, words = SICK[case]
+    found = {diagnosis.id: diagnosis.text for diagnosis in diagnose(scene)}
+    assert case.split()[0] in found
+    assert words in found[case.split()[0]]
+
+
+@pytest.mark.parametrize("case", HEALTHY)
+def test_not_made_of_the_healthy(case: str) -> None:
+    assert diagnose(HEALTHY[case]) == []
+
+
+def test_every_row_has_a_case() -> None:
+    ids = [row.id for row in ROWS]
+    assert len(set(ids)) == len(ids)
+    assert {case.split()[0] for case in SICK} == set(ids)
+
+
+@pytest.mark.parametrize(
+    ("case", "near"),
+    [
+        ("tai-utc", Scene(stream(delay_ms=-35_000.0), clock())),
+        ("leap-second", Scene(leapt(0.8), clock())),
+        ("clock-skew", SICK["latency-step"][0]),
+        ("clock-skew", Scene(stream(delay_ms=44 + np.arange(COUNT) / 60 * 0.0005), clock())),
+        ("latency-step", SICK["clock-skew"][0]),
+        ("delay-of-a-period", Scene(stream(delay_ms=44.0), clock(), (stream(), stream(rate=30)))),
+        ("rate-mismatch", Scene(slots(np.flatnonzero(RNG.random(COUNT) > 0.4)), clock())),
+        ("two-senders", SICK["rate-mismatch faster"][0]),
+        ("multicast-ageing", Scene(silent_after(60), clock())),
+        ("multicast-ageing", Scene(stream(260 * 60, end_ns=START_NS + 400 * NS), clock())),
+        ("tcp-batching", Scene(stream(delay_ms=44 + sawtooth), clock())),
+        ("uneven-arrival", Scene(slots(np.flatnonzero(RNG.random(COUNT) > 0.1)), clock())),
+        ("locked-but-off", Scene(stream(delay_ms=4.8 * 86_400_000, time_quality=0xF), clock())),
+        ("locked-but-off", SICK["tai-utc"][0]),
+        ("unsynchronised", Scene(stream(stat=0x0800), clock())),
+    ],
+)
+def test_not_made_of_what_is_only_near(case: str, near: Scene) -> None:
+    assert case not in {diagnosis.id for diagnosis in diagnose(near)}
