@@ -16,7 +16,7 @@ from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.reel import I64
 from pmutools.tools.player.results import Results
 from pmutools.tools.player.route import Gate
-from pmutools.tools.player.sheet import FAILED, SENT, SKIPPED, Sheet
+from pmutools.tools.player.sheet import FAILED, SENT, SKIPPED, Sheet, changes
 
 TOGETHER_FRAMES = 1024
 """Frames that leave with one system call at most."""
@@ -97,15 +97,9 @@ class Delivery:
             self._ledger.stamp(*self._senders.departures())
 
     def _stops(self, sheet: Sheet) -> list[int]:
-        """The rows whose configuration is another than that of the stream's row before."""
+        """The rows before which a configuration is changed: what is not sent changes none."""
         sent = np.flatnonzero(sheet.fate == SENT)
-        if np.array_equal(self._editions[sheet.part[sent]], sheet.edition[sent]):
-            return []
-        editions, stops = self._editions.copy(), []
-        for row in sent.tolist():
-            if editions[sheet.part[row]] != sheet.edition[row]:
-                editions[sheet.part[row]] = sheet.edition[row]
-                stops.append(row)
+        stops: list[int] = sent[changes(self._editions, sheet.part[sent], sheet.edition[sent])].tolist()
         return stops
 
     def _reconfigure(self, sheet: Sheet, row: int) -> None:

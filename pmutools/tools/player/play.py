@@ -100,7 +100,7 @@ class Player:
         self._state = PlayState.WAITING
         self._plan: Plan | None = None
         self._anchor_ns = 0
-        self._recent = deque[tuple[int, int]]()
+        self._recent = deque[tuple[int, int]](maxlen=2)
         self._actions = deque[Action]()
         self.senders = senders or Senders(
             clock,
@@ -243,8 +243,6 @@ class Player:
                 return
             due_ns = now_ns + UTC_CHECK_NS
             self._recent.append((now_ns, self.results.sent))
-            while len(self._recent) > 2:
-                self._recent.popleft()
             now = utc_offset(clock, tries=3)
             if step_ns := utc.step_ns(now):
                 utc = now

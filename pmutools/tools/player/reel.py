@@ -51,7 +51,6 @@ class Track:
     first_ns: int = FOREVER
     last_ns: int = -FOREVER
     first_due_ns: int = FOREVER
-    last_due_ns: int = -FOREVER
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,7 +62,6 @@ class Track:
         self.frames += len(stamp_ns)
         self.first_ns, self.last_ns = min(self.first_ns, int(stamp_ns.min())), max(self.last_ns, int(stamp_ns.max()))
         self.first_due_ns = min(self.first_due_ns, int(due_ns.min()))
-        self.last_due_ns = max(self.last_due_ns, int(due_ns.max()))
 
 
 @dataclass(frozen=True)
@@ -297,7 +295,7 @@ def without_gaps(reel: Reel, longest_ns: int) -> tuple[Reel, int]:
 
 
 def _retimed(track: Track, rows: Rows) -> Track:
-    retimed = replace(track, frames=0, first_ns=FOREVER, last_ns=-FOREVER, first_due_ns=FOREVER, last_due_ns=-FOREVER)
+    retimed = replace(track, frames=0, first_ns=FOREVER, last_ns=-FOREVER, first_due_ns=FOREVER)
     retimed.add(rows.stamp_ns, rows.due_ns)
     return retimed
 

@@ -20,7 +20,7 @@ from pmutools.impair.profile import Action
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.dress import Dressed
 from pmutools.tools.player.reel import I64
-from pmutools.tools.player.sheet import EMPTY, FATES, Extra, Sheet, clean, joined
+from pmutools.tools.player.sheet import EMPTY, FATES, Extra, Sheet, changes, clean, joined
 
 _FATE_CODES = {fate: code for code, fate in enumerate(FATES)}
 
@@ -83,23 +83,12 @@ class Route:
         if not self._mode.any() and np.array_equal(self._edition[parts], editions):
             return sheet
         pieces, first = [], 0
-        for row in self._changes(parts, editions):
+        for row in changes(self._edition, parts, editions):
             pieces.append(self._faulty(sheet.take(slice(first, row)), stream_ns[first:row]))
             first = row
             self._configure(int(parts[row]), int(editions[row]))
         pieces.append(self._faulty(sheet.take(slice(first, None)), stream_ns[first:]))
         return joined(pieces)
-
-    def _changes(self, parts: npt.NDArray[np.int32], editions: npt.NDArray[np.int32]) -> list[int]:
-        """The rows before which a stream's configuration changes."""
-        now, changes = self._edition.copy(), list[int]()
-        if np.array_equal(now[parts], editions):
-            return changes
-        for row, (part, edition) in enumerate(zip(parts.tolist(), editions.tolist(), strict=True)):
-            if now[part] != edition:
-                now[part] = edition
-                changes.append(row)
-        return changes
 
     def _configure(self, part: int, edition: int) -> None:
         self._edition[part] = edition

@@ -155,4 +155,17 @@ def clean(
     )
 
 
+def changes(before: npt.NDArray[np.int32], part: npt.NDArray[np.int32], edition: npt.NDArray[np.int32]) -> list[int]:
+    """The rows (of N) whose configuration is another than that of their part's row before, or than ``before`` (P,)."""
+    rows = list[int]()
+    if np.array_equal(before[part], edition):
+        return rows
+    now = before.copy()
+    for row, (of, new) in enumerate(zip(part.tolist(), edition.tolist(), strict=True)):
+        if now[of] != new:
+            now[of] = new
+            rows.append(row)
+    return rows
+
+
 EMPTY = Sheet(**{name: np.zeros(0, _TYPES.get(name, np.int64)) for name in _COLUMNS}, wire=np.zeros(0, np.uint8))
