@@ -146,7 +146,10 @@ BLOCK_S = 2
 
 
 class PlantSource:
-    """A simulated plant as a source: made as it is read, and the same each time it is opened."""
+    """A simulated plant as a source: made as it is read, and the same each time it is opened.
+
+    Raises SettingsError for names of plants and scenarios that there are not.
+    """
 
     kind = "synth"
 
@@ -170,11 +173,6 @@ class PlantSource:
             else:
                 self.tally.count(item.frame.type, 1, len(item.frame.data))
             yield item
-
-
-def plant_source(recipe: Recipe) -> PlantSource:
-    """What ``pmu play --plant`` plays. Raises SettingsError for names of plants and scenarios that there are not."""
-    return PlantSource(recipe)
 
 
 def plant_blocks(recipe: Recipe) -> Iterator[Block | Message]:

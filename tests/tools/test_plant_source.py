@@ -13,7 +13,7 @@ from pmutools.c37118.checksum import chk_array
 from pmutools.c37118.demux import Message
 from pmutools.errors import SettingsError
 from pmutools.formats.source import Block, gather
-from pmutools.tools.synth import Recipe, plant_source
+from pmutools.tools.synth import PlantSource, Recipe
 
 
 def frames_by_stream(items: Any) -> dict[int, list[tuple[int, bytes]]]:
@@ -39,8 +39,8 @@ def frames_by_stream(items: Any) -> dict[int, list[tuple[int, bytes]]]:
 )
 def test_blocks_hold_the_frames_of_the_messages(recipe: Recipe) -> None:
     """Each stream's bytes and arrivals; numbers may differ in the last bit of a float32."""
-    source = plant_source(recipe)
-    ours, theirs = list(source.blocks()), list(gather(plant_source(recipe).items()))
+    source = PlantSource(recipe)
+    ours, theirs = list(source.blocks()), list(gather(PlantSource(recipe).items()))
     openings = [[item for item in items if isinstance(item, Message)] for items in (ours, theirs)]
     assert openings[0] == openings[1]
     found, expected = frames_by_stream(ours), frames_by_stream(theirs)
@@ -60,7 +60,7 @@ def test_blocks_hold_the_frames_of_the_messages(recipe: Recipe) -> None:
 
 
 def test_longer_than_the_scenario_and_counted() -> None:
-    source = plant_source(Recipe(pmus=1, rate=10, duration_s=100))
+    source = PlantSource(Recipe(pmus=1, rate=10, duration_s=100))
     blocks = [item for item in source.blocks() if isinstance(item, Block)]
     assert sum(len(block.batch) for block in blocks) == 1000
     assert source.tally.frames == {3: 1, 0: 1000}
@@ -71,7 +71,7 @@ def test_longer_than_the_scenario_and_counted() -> None:
 
 def test_the_first_block_comes_at_once() -> None:
     """A day of plant costs no more than what is read of it."""
-    source = plant_source(Recipe(duration_s=86400))
+    source = PlantSource(Recipe(duration_s=86400))
     first = next(item for item in itertools.islice(source.blocks(), 20) if isinstance(item, Block))
     assert len(first.batch) == 120
 
@@ -79,4 +79,4 @@ def test_the_first_block_comes_at_once() -> None:
 @pytest.mark.parametrize("recipe", [Recipe("cbj"), Recipe(plant="nodal"), Recipe("bc-us-separation", "modal-five")])
 def test_unknown_names_are_told_before_anything_is_read(recipe: Recipe) -> None:
     with pytest.raises(SettingsError):
-        plant_source(recipe)
+        PlantSource(recipe)

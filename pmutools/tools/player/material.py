@@ -12,7 +12,7 @@ from pmutools.tools.player.cast import Cast, Spread, as_recorded, emulated
 from pmutools.tools.player.reel import Reel, at_interval, at_rate, record, without_gaps
 from pmutools.tools.recast import Changes, Form, concentrated, described, reformatted, renamed, renumbered
 from pmutools.tools.recordings import losses, open_recordings
-from pmutools.tools.synth import Recipe, plant_source
+from pmutools.tools.synth import PlantSource, Recipe
 from pmutools.tools.window import Window
 
 Items = Iterable[Block | Message | Loss]
@@ -80,7 +80,7 @@ def material(choice: Choice, watched: Callable[[Source], Source] = lambda source
 
 def _opened(choice: Choice) -> Source:
     if choice.plant is not None:
-        return plant_source(choice.plant)
+        return PlantSource(choice.plant)
     return open_recordings(choice.files, data_rate=choice.data_rate, fnom_hz=choice.fnom_hz)
 
 
