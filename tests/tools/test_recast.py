@@ -432,7 +432,7 @@ def small_blocks(*recordings: list[Message], size: int) -> Callable[[], Iterable
 
 
 def test_late_and_repeated_frames_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pmutools.tools.recast.WINDOW_FRAMES", 10)
+    monkeypatch.setattr("pmutools.tools.recast.concentrate.WINDOW_FRAMES", 10)
     one, two = pmu(11, frames=40), pmu(12, frames=40)
     changes = Changes()
     items = list(concentrated(small_blocks([*one, one[-1]], two, size=8), 300, changes=changes))
