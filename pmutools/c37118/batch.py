@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
-from pmutools.c37118.checksum import chk_array
+from pmutools.c37118.checksum import chk_array, seal_array
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import INT16_FILLER, STAT_DATA_ERROR_MASK, FrameType
 from pmutools.c37118.frames import RAD_PER_COUNT, Data
@@ -278,7 +278,7 @@ def encode_batch(batch: Batch) -> tuple[npt.NDArray[np.uint8], int]:
         rows = slice(first, first + step)
         with _quiet():
             clipped += sum(_put(wire[rows], batch[rows], layout, run) for run in layout.runs)
-        wire["chk"][rows] = chk_array(octets[rows, :-2])
+        seal_array(octets[rows])
     return octets, clipped
 
 

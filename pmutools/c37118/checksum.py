@@ -41,3 +41,8 @@ def chk_array(frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     count, size = frames.shape
     rows = struct.iter_unpack(f"{size}s", np.ascontiguousarray(frames).data)  # N bytes objects at little cost
     return np.fromiter(starmap(chk, rows), np.uint16, count)
+
+
+def seal_array(frames: npt.NDArray[np.uint8]) -> None:
+    """Make the CHK of each frame (N, FRAMESIZE) anew, in place."""
+    frames[:, -2:] = chk_array(frames[:, :-2]).astype(">u2")[:, None].view("u1")

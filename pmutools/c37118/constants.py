@@ -10,6 +10,8 @@ from enum import IntEnum, IntFlag
 SYNC = 0xAA
 PREFIX_SIZE = 14
 CHK_SIZE = 2
+FIRST_IDCODE, LAST_IDCODE = 1, 65534
+"""0 means none, 65535 is reserved."""
 MIN_FRAME_SIZE = PREFIX_SIZE + CHK_SIZE
 MAX_FRAME_SIZE = 0xFFFF
 NAME_SIZE = 16

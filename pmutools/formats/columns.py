@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools.c37118.batch import Batch, encode_batch
-from pmutools.c37118.checksum import chk_array
+from pmutools.c37118.checksum import seal_array
 from pmutools.c37118.config import Station, StreamConfig
 from pmutools.c37118.constants import INT16_FILLER, STAT_ABSENT, STAT_DATA_ERROR_MASK, Format
 from pmutools.c37118.frames import RAD_PER_COUNT
@@ -234,6 +234,6 @@ def _with_polar_wire(batch: Batch, magnitude: Floats, degrees: Floats) -> Batch:
             else:
                 given = ~np.isnan(sizes) | ~np.isnan(angles)
                 raw[..., 0][given], raw[..., 1][given] = counts[given], turned[given]
-    wire["chk"] = chk_array(octets[:, :-2])
+    seal_array(octets)
     wire.flags.writeable = False
     return replace(batch, wire=wire)

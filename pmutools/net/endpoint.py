@@ -22,6 +22,7 @@ from difflib import get_close_matches
 from enum import StrEnum
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from pmutools.c37118.constants import FIRST_IDCODE, LAST_IDCODE
 from pmutools.errors import SettingsError
 
 
@@ -122,7 +123,7 @@ def parse_endpoint(url: str) -> Endpoint:
         scheme,
         host,
         port,
-        idcode=_number(url, query, "idcode", 1, 65534),
+        idcode=_number(url, query, "idcode", FIRST_IDCODE, LAST_IDCODE),
         iface=query.get("iface"),
         source=_address(url, query, "source"),
         data_host=data_host,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pmutools import timebase
 from pmutools.c37118.batch import STAMP_SOURCES, Batch, decode_batch
-from pmutools.c37118.checksum import chk_array
+from pmutools.c37118.checksum import seal_array
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message, Tally
@@ -210,7 +210,7 @@ def _batch(
     for number, pmu in enumerate(stream.pmus):
         _put(wire[f"s{number}"], pmu, slots, courses[pmu.bus], stream.nominal_hz)
     octets = wire.view(np.uint8).reshape(len(wire), config.frame_size)
-    wire["chk"] = chk_array(octets[:, :-2])
+    seal_array(octets)
     wire.flags.writeable = False
     head = octets[0].tobytes()  # delays ask for a frame's type only
     arrivals = [each.arrival_ns(slot, head, time_ns) for slot, time_ns in zip(slots, times_ns, strict=True)]

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pmutools import draws, parsers
 from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.constants import NAME_SIZE, PREFIX_SIZE
+from pmutools.c37118.constants import LAST_IDCODE, NAME_SIZE, PREFIX_SIZE
 from pmutools.errors import SettingsError
 from pmutools.parsers import bind, call, parsed_by
 from pmutools.timebase import NS
@@ -26,8 +26,6 @@ from pmutools.tools.player.reel import I64, Reel, Track, of_tracks
 
 AHEAD_NS = 20_000_000
 """Frames are looked up this far ahead at once."""
-IDCODES = 65_534
-"""IDCODE 0 means none, 65535 is reserved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +216,8 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
 
     ``stagger`` spreads their phases evenly over a reporting interval. Raises SettingsError for more PMUs than IDCODEs.
     """
-    if not 1 <= count <= IDCODES:
-        raise SettingsError(f"--emulate {count}: between 1 and {IDCODES} PMUs have IDCODEs of their own")
+    if not 1 <= count <= LAST_IDCODE:
+        raise SettingsError(f"--emulate {count}: between 1 and {LAST_IDCODE} PMUs have IDCODEs of their own")
     if count < len(reel.tracks):
         reel = of_tracks(reel, count)
     first = reel.tracks[0].config.idcode
@@ -228,7 +226,7 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         place = number % len(reel.tracks)
         track = reel.tracks[place]
         name = clone_name(track, number, count)
-        idcode = (first - 1 + number) % IDCODES + 1
+        idcode = (first - 1 + number) % LAST_IDCODE + 1
         phase_ns = int(_period_ns(reel, track) * number / count) if stagger else 0
         part = Part(place, name, idcode, phase_ns, emulated=True)
         parts.append(_spread(part, number, spread, seed) if spread else part)

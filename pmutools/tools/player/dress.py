@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
+from pmutools.c37118.checksum import seal_array
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.reel import I64
-from pmutools.tools.player.stamps import gathered, seal, write_idcodes, write_stamps
+from pmutools.tools.player.stamps import SOC, gathered, write_idcodes, write_stamps
 
 
 class Dressed(NamedTuple):
@@ -41,7 +42,7 @@ def dress(
             stamps = stamps_ns[chosen]
             if whole_seconds:
                 moved = (stamps - reel.rows.source_ns[rows[chosen]]) // timebase.NS
-                soc = frames[:, 6:10].copy().view(">u4")[:, 0].astype(np.int64) + moved
+                soc = frames[:, SOC].copy().view(">u4")[:, 0].astype(np.int64) + moved
                 write_stamps(frames, soc, None)
             else:
                 write_stamps(frames, *timebase.from_ns_array(stamps, reel.time_bases[edition[chosen]]))
@@ -49,7 +50,7 @@ def dress(
             _alter(cast, frames, rows[chosen], parts[chosen], None if stamps_ns is None else stamps_ns[chosen])
             write_idcodes(frames, cast.idcodes[parts[chosen]])
         if cast.emulated or stamps_ns is not None:
-            seal(frames)
+            seal_array(frames)
         if len(sizes) == 1:
             return Dressed(frames.reshape(-1), starts, nbytes)
         places = starts[chosen, None] + np.arange(size)

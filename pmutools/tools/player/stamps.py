@@ -17,8 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
-from pmutools.c37118.checksum import chk_array
-from pmutools.c37118.constants import CHK_SIZE
 from pmutools.timebase import NS
 from pmutools.tools.player.reel import I64, Reel, slot_times
 
@@ -53,7 +51,7 @@ def gathered(wire: npt.NDArray[np.uint8], at: I64, size: int) -> npt.NDArray[np.
 
 
 def write_stamps(frames: npt.NDArray[np.uint8], soc: I64, fracsec: I64 | None) -> None:
-    """SOC and, if given, FRACSEC of frames (N, size); CHK is left to :func:`seal`."""
+    """SOC and, if given, FRACSEC of frames (N, size); CHK is left as it was."""
     frames[:, SOC] = soc.astype(">u4")[:, None].view(np.uint8)
     if fracsec is not None:
         frames[:, FRACSEC] = fracsec.astype(">u4")[:, None].view(np.uint8)[:, 1:]
@@ -62,8 +60,3 @@ def write_stamps(frames: npt.NDArray[np.uint8], soc: I64, fracsec: I64 | None) -
 def write_idcodes(frames: npt.NDArray[np.uint8], idcodes: npt.NDArray[np.uint16]) -> None:
     """IDCODE of frames (N, size)."""
     frames[:, IDCODE] = idcodes.astype(">u2")[:, None].view(np.uint8)
-
-
-def seal(frames: npt.NDArray[np.uint8]) -> None:
-    """CHK of frames (N, size), computed anew."""
-    frames[:, -CHK_SIZE:] = chk_array(frames[:, :-CHK_SIZE]).astype(">u2")[:, None].view(np.uint8)

@@ -14,6 +14,8 @@ from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch, decode_batch, e
 from pmutools.c37118.config import StreamConfig, as_kind, encode_config
 from pmutools.c37118.constants import (
     CHK_SIZE,
+    FIRST_IDCODE,
+    LAST_IDCODE,
     MAX_FRAME_SIZE,
     PREFIX_SIZE,
     STAT_ABSENT,
@@ -25,7 +27,6 @@ from pmutools.errors import EncodeError, SettingsError
 from pmutools.flow import Flow
 from pmutools.formats.source import BLOCK_FRAMES, Block, gather
 from pmutools.tools.recast.changes import Changes, Item, Stream, announcement, sealed_frames
-from pmutools.tools.recast.identity import FIRST_IDCODE, LAST_IDCODE
 
 WINDOW_NS = 4 * timebase.NS
 """Frames may come this much later, in time of stamps, than any other of the same instant."""

@@ -8,10 +8,7 @@ from dataclasses import replace
 
 from pmutools.c37118.batch import Batch
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.constants import (
-    NAME_SIZE,
-    FrameType,
-)
+from pmutools.c37118.constants import FIRST_IDCODE, LAST_IDCODE, NAME_SIZE, FrameType
 from pmutools.c37118.demux import Loss, Message
 from pmutools.c37118.frames import restamp
 from pmutools.c37118.prefix import decode_prefix
@@ -19,7 +16,6 @@ from pmutools.errors import SettingsError
 from pmutools.formats.source import Block
 from pmutools.tools.recast.changes import Changes, Item, configured, sealed_frames
 
-FIRST_IDCODE, LAST_IDCODE = 1, 65534
 NAME_SIZE_CFG3 = 255
 
 
