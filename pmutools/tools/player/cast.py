@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -227,18 +226,10 @@ def emulated(reel: Reel, count: int, seed: int, *, stagger: bool = True, spread:
         track = reel.tracks[place]
         name = clone_name(track, number, count)
         idcode = (first - 1 + number) % LAST_IDCODE + 1
-        phase_ns = int(_period_ns(reel, track) * number / count) if stagger else 0
+        phase_ns = int(reel.period_ns(track.config.rate) * number / count) if stagger else 0
         part = Part(place, name, idcode, phase_ns, emulated=True)
         parts.append(_spread(part, number, spread, seed) if spread else part)
     return Cast(reel, parts)
-
-
-def _period_ns(reel: Reel, track: Track) -> Fraction:
-    """From one frame of a track to its next; 0 where no rate is known."""
-    if reel.interval_ns is not None:
-        return Fraction(reel.interval_ns)
-    rate = track.config.rate if reel.fps is None else Fraction(reel.fps)
-    return NS / rate if rate else Fraction(0)
 
 
 def clone_name(track: Track, number: int, count: int) -> str:

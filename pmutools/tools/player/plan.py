@@ -68,7 +68,7 @@ class Plan:
         self._route = Route(cast, pipelines, marks=marks)
         self._timeline = deque(timeline)
         self._totals = np.array([track.total for track in self._reel.tracks], np.int64)
-        self._period_ns = _period_ns(cast.reel)
+        self._period_ns = _shortest_period_ns(cast.reel)
         self._planned_ns = 0
         self._cursor_ns = 0
         self._loop = 0
@@ -447,10 +447,7 @@ class Plan:
         return self._route.act(action)
 
 
-def _period_ns(reel: Reel) -> Fraction:
+def _shortest_period_ns(reel: Reel) -> Fraction:
     """The shortest time between two frames of a stream; a second where no rate is known."""
-    if reel.interval_ns is not None:
-        return Fraction(reel.interval_ns)
-    editions = [reel.editions[edition] for edition in np.unique(reel.rows.edition)]
-    rates = [Fraction(reel.fps)] if reel.fps is not None else [config.rate for config in editions]
-    return NS / (max(rates) or Fraction(1))
+    periods = [reel.period_ns(reel.editions[edition].rate) for edition in np.unique(reel.rows.edition)]
+    return min(filter(None, periods), default=Fraction(NS))

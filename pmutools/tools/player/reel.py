@@ -113,6 +113,13 @@ class Reel:
         object.__setattr__(self, "sizes", np.array([config.frame_size for config in self.editions], np.int64))
         object.__setattr__(self, "time_bases", np.array([config.time_base for config in self.editions], np.int64))
 
+    def period_ns(self, rate: Fraction) -> Fraction:
+        """From one frame of a stream of this rate (frames/s) to its next, as it is played; 0 where none is known."""
+        if self.interval_ns is not None:
+            return Fraction(self.interval_ns)
+        rate = rate if self.fps is None else Fraction(self.fps)
+        return NS / rate if rate else Fraction(0)
+
     @property
     def first_due_ns(self) -> int:
         """The due time of the first frame: position 0."""
@@ -231,17 +238,13 @@ def _sorted(rows: Rows) -> Rows:
     return rows[np.argsort(rows.due_ns, kind="stable")]
 
 
-def _period_ns(tracks: Sequence[Track]) -> int:
-    """The longest reporting interval; a second where no rate is known."""
-    return max((round(NS / track.config.rate) for track in tracks if track.config.rate), default=NS)
-
-
 def _round_ns(tracks: Sequence[Track], rows: Rows) -> int:
-    """Whole seconds from one loop to the next: no stamp comes twice, and at most the last ones are overtaken.
+    """Whole seconds from one loop to the next, so that no stamp comes twice.
 
-    Recorded stamps are rounded, so one that is a tenth of a reporting interval late does not cost a second.
+    Recorded stamps are rounded, so one that is a tenth of a reporting interval late does not cost a second; neither
+    does a last frame that is late by less than half of what a latency may be: it leaves amid the next round.
     """
-    period_ns = _period_ns(tracks)
+    period_ns = max((round(NS / track.config.rate) for track in tracks if track.config.rate), default=NS)
     stamps_ns = max(track.last_ns for track in tracks) - min(track.first_ns for track in tracks)
     due_ns = int(rows.due_ns[-1] - rows.due_ns[0])
     return -(-max(stamps_ns + period_ns - period_ns // 10, due_ns - LATENCY_MAX_NS // 2, 1) // NS) * NS
