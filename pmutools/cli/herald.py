@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import sys
 import time
+from collections.abc import Callable
 
 from pmutools.cli.shell import Talk
 
@@ -36,10 +37,10 @@ class Herald:
             self._unsaid = 0
         self._talk.say(text[:LINE_CHARACTERS])
 
-    def progress(self, text: str) -> None:
-        """A line that the next one overwrites."""
-        if _taken():
-            self._talk.progress(text[:LINE_CHARACTERS])
+    def progress(self, line: Callable[[], str]) -> None:
+        """A line that the next one overwrites; it is not made where nobody would see it."""
+        if not self._talk.quiet and sys.stderr.isatty() and _taken():
+            self._talk.progress(line()[:LINE_CHARACTERS])
 
 
 LINE_CHARACTERS = 1000

@@ -216,7 +216,7 @@ def command(
         if display is None:
             from pmutools.cli.status_text import progress_line
 
-            herald.progress(progress_line(player.status()))
+            herald.progress(lambda: progress_line(player.status()))
 
     with interruptible() as asked, ExitStack() as stack:
         player = stack.enter_context(
