@@ -16,10 +16,10 @@ from dcon.core.state import State, initial_state
 from dcon.core.step import step
 from dcon.core.values import Event, Inputs, Mode, Order, Record, Sample
 from dcon.frontend import Binding, Reading, bind
-from dcon.settings import Site
 from pmutools.c37118 import Frame, StreamConfig
 from pmutools.errors import SettingsError, WireError
 from pmutools.schema.pmu_log import PmuFrame
+from pmutools.sites import Site
 
 
 @dataclass(frozen=True)

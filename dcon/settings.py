@@ -8,63 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from dcon.core.params import Pair, Params, PmuParams, Thresholds
-from pmutools.errors import SettingsError, SourceError
-from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
-from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
+from pmutools.errors import SettingsError
+from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.parsers import Parser, boolean, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
+from pmutools.sites import Site, endpoint, read_ini, sites_of
 
-SIDES = ("north", "south", "none")
 PARAMS = {item.name: item for item in fields(Params)}
 FROM_SITES = frozenset(("pmus", "instances", "thresholds", "rate_hz"))
 """Fields of Params that follow from the PMUs' sections: no keys of ``[controller]``."""
 _RATE = PARAMS["rate_hz"].metadata
-
-
-def _endpoint(text: str) -> Endpoint:
-    try:
-        return parse_endpoint(text)
-    except SettingsError as error:
-        raise ValueError(error) from None  # the reader adds where
+RATE_HZ = 60
+"""Of a PMU whose section names none."""
 
 
 def _destination(text: str) -> Endpoint:
-    endpoint = _endpoint(text)
-    if endpoint.scheme is not Scheme.UDP or not endpoint.port:
+    where = endpoint(text)
+    if where.scheme is not Scheme.UDP or not where.port:
         raise ValueError(f"{text}: commands leave as udp://HOST:PORT")
-    return endpoint
-
-
-def _voltage(text: str) -> tuple[str, ...]:
-    channels = words(text)
-    if len(set(channels)) != len(channels) or len(channels) not in (1, 3):
-        raise ValueError(f"{text!r} is neither one positive-sequence channel nor three phases VA,VB,VC")
-    return channels
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """``[pmu NAME]``: one PMU of the controller."""
-
-    name: str
-    url: Endpoint = field(metadata=parsed_by(_endpoint))
-    """Where its stream comes from."""
-    idcode: int | None = field(default=None, metadata=parsed_by(integer(1, 65534)))
-    """IDCODE of the stream; the only one there is unless given."""
-    station: str | None = field(default=None, metadata=parsed_by(str))
-    """Station of a stream with several."""
-    side: str = field(default="none", metadata=parsed_by(choice(*SIDES)))
-    """``north``, ``south``, or ``none`` for a PMU that is recorded only."""
-    voltage: tuple[str, ...] = field(default=("VA", "VB", "VC"), metadata=parsed_by(_voltage))
-    """Positive-sequence channel, or those of the three phases."""
-    nominal_kv: float | None = field(default=None, metadata=parsed_by(number(0.1, 2000)))
-    """Line-to-line; without it the voltage's magnitude is not judged."""
-    rate: int = field(default=60, metadata=parsed_by(integer(_RATE["low"], _RATE["high"])))
-    """Frames per second; the same for all."""
-
-    @property
-    def stream(self) -> int | None:
-        """IDCODE of the stream, from either key."""
-        return self.url.idcode if self.idcode is None else self.idcode
+    return where
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +74,7 @@ class Settings:
 
 def load(path: str | Path) -> Settings:
     """Read an initialisation file. Raises SourceError where it cannot be read, SettingsError for what is in it."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "is no UTF-8 text"
-        raise SourceError(f"{path}: {reason}") from None
-    return parse(text, str(path))
+    return from_ini(*read_ini(path))
 
 
 def parse(text: str, source: str, changes: tuple[str, ...] = ()) -> Settings:
@@ -129,16 +86,11 @@ def parse(text: str, source: str, changes: tuple[str, ...] = ()) -> Settings:
 
 
 def from_ini(ini: Ini, text: str = "") -> Settings:
-    ini.only("pmu *", "controller", "supervisor", "platform", "watchdog", "server", "output", "pdci", "log")
+    sites = sites_of(ini)
     for name in ("watchdog", "server", "pdci"):
         fill(Reserved, ini.section(name))
-    sections = ini.family("pmu")
-    if not sections:
-        raise SettingsError(f"{ini.source}: no [pmu NAME] section; add one for each PMU")
-    sites = tuple(fill(Site, section, name=section.argument) for section in sections)
-    _check_apart(sections, sites)
     return Settings(
-        _params(ini, sections, sites),
+        _params(ini, sites),
         sites,
         fill(Output, ini.section("output")),
         fill(Platform, ini.section("platform")),
@@ -147,31 +99,19 @@ def from_ini(ini: Ini, text: str = "") -> Settings:
     )
 
 
-def _check_apart(sections: tuple[Section, ...], sites: tuple[Site, ...]) -> None:
-    """Raise SettingsError for a PMU that would be given the frames of another, or that has two IDCODEs."""
-    for index, (section, site) in enumerate(zip(sections, sites, strict=True)):
-        if site.idcode is not None and site.url.idcode not in (None, site.idcode):
-            raise section.entries["idcode"].where.error(f"{site.idcode}, but the url says {site.url.idcode}; keep one")
-        for other in sites[:index]:
-            if _overlap(site, other):
-                problem = f"{site.url} gives it the frames of {other.name} too"
-                raise section.where.error(f"{problem}; tell the two apart by idcode, station or ?source=")
+def rate_of(site: Site) -> int:
+    """Frames per second."""
+    return RATE_HZ if site.rate is None else site.rate
 
 
-def _overlap(site: Site, other: Site) -> bool:
-    one, two = site.url, other.url
-    if (one.scheme, one.host, one.port) != (two.scheme, two.host, two.port):
-        return False
-    pairs = ((site.stream, other.stream), (site.station, other.station), (one.source, two.source))
-    return all(None in pair or pair[0] == pair[1] for pair in pairs)
-
-
-def _params(ini: Ini, sections: tuple[Section, ...], sites: tuple[Site, ...]) -> Params:
-    for section, site in zip(sections, sites, strict=True):
-        if site.rate != sites[0].rate:
-            entry = section.entries.get("rate") or section.entries["url"]
+def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
+    for section, site in zip(ini.family("pmu"), sites, strict=True):
+        if entry := section.entries.get("rate"):
+            entry.read(integer(_RATE["low"], _RATE["high"]))
+        if rate_of(site) != rate_of(sites[0]):
+            entry = entry or section.entries["url"]
             raise entry.where.error(
-                f"{site.rate} frames/s, but {sites[0].name} has {sites[0].rate}; the controller needs one rate"
+                f"{rate_of(site)} frames/s, but {sites[0].name} has {rate_of(sites[0])}; the controller needs one rate"
             )
     section = ini.section("controller")
     entries = dict(section.entries)
@@ -188,7 +128,7 @@ def _params(ini: Ini, sections: tuple[Section, ...], sites: tuple[Site, ...]) ->
             pmus=tuple(PmuParams(site.name, site.nominal_kv) for site in sites),
             instances=instances,
             thresholds=thresholds,
-            rate_hz=sites[0].rate,
+            rate_hz=rate_of(sites[0]),
             **given,
         )
     except SettingsError as error:

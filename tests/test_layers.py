@@ -20,7 +20,7 @@ LAYERS = [
     # the codec, sans-I/O
     ["pmutools.c37118"],
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],
-    ["pmutools.grid", "pmutools.formats", "pmutools.measure"],
+    ["pmutools.grid", "pmutools.formats", "pmutools.measure", "pmutools.sites"],
     ["pmutools.tools"],
     ["pmutools.cli"],
     # the controller

@@ -15,7 +15,8 @@ from pmutools.cli.shell import common
 @common
 def command(ini: str, as_json: bool, quiet: bool, verbose: int) -> None:
     """Read an initialisation file as the controller would, and print what is in force, with units and sources."""
-    from dcon.settings import Site, effective, load
+    from dcon.settings import effective, load
+    from pmutools.sites import Site
 
     settings = load(ini)
     sites = [

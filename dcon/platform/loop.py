@@ -14,7 +14,7 @@ import gc
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, Trigger
@@ -25,13 +25,12 @@ from dcon.platform.orders import OrderBook, TimedOrder
 from dcon.platform.schedule import TickGrid
 from dcon.session.codec import Timing
 from dcon.session.log import SessionWriter
-from dcon.settings import Settings, Site
+from dcon.settings import Settings
 from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
 from pmutools.clock import Clock, SystemClock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
-from pmutools.net.endpoint import Endpoint
 from pmutools.net.receiver import Receivers
 from pmutools.realtime import go_realtime
 from pmutools.timebase import NS
@@ -82,11 +81,6 @@ class Summary:
     final_state: str = ""
 
 
-def endpoint_of(site: Site) -> Endpoint:
-    """Where a PMU's stream is received from, its IDCODE included."""
-    return replace(site.url, idcode=site.stream)
-
-
 class Platform:
     """A session from sockets to sockets. Sockets are open once this is made, so that nothing sent later is missed."""
 
@@ -97,7 +91,7 @@ class Platform:
         self.engine = Engine(settings.params, settings.sites)
         self.driver = UdpCommandDriver(settings.output.url) if settings.output.url is not None else None
         try:
-            self.receivers = Receivers([endpoint_of(site) for site in settings.sites], self.clock)
+            self.receivers = Receivers([site.endpoint for site in settings.sites], self.clock)
         except BaseException:
             if self.driver is not None:
                 self.driver.close()

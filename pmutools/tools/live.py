@@ -7,17 +7,21 @@ from pathlib import Path
 from types import TracebackType
 
 from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
 from pmutools.clock import Clock, SystemClock
-from pmutools.flow import Chunk
-from pmutools.formats.source import Block, gather
+from pmutools.flow import Chunk, Flow
+from pmutools.formats.source import Block, Gatherer, gather
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.net.receiver import Receivers
 from pmutools.net.sockets import RCVBUF_BYTES
+from pmutools.sites import Site
 
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
+ROUND_NS = 250_000_000
+"""How long data frames are gathered before they are handed on."""
 
 
 class LiveSource:
@@ -32,7 +36,7 @@ class LiveSource:
 
     def __init__(
         self,
-        urls: Sequence[str | Endpoint],
+        urls: Sequence[str | Endpoint | Site],
         *,
         duration_ns: int | None = None,
         configs: Iterable[StreamConfig] = (),
@@ -41,7 +45,9 @@ class LiveSource:
         clock: Clock | None = None,
         rcvbuf_bytes: int = RCVBUF_BYTES,
     ) -> None:
-        endpoints = [parse_endpoint(url) if isinstance(url, str) else url for url in urls]
+        self.sites = tuple(url if isinstance(url, Site) else None for url in urls)
+        """The sites among ``urls``, by place."""
+        endpoints = [_endpoint(url) for url in urls]
         self.path = Path(str(endpoints[0]) if len(endpoints) == 1 else f"{len(endpoints)} endpoints")
         self.clock = clock or SystemClock()
         self.receivers = Receivers(endpoints, self.clock, configs=configs, rcvbuf_bytes=rcvbuf_bytes)
@@ -78,6 +84,31 @@ class LiveSource:
             found += self.receivers.parse(item)
         return found
 
+    def rounds(self, round_ns: int = ROUND_NS) -> Iterator[list[Block | Message | Loss]]:
+        """What came, gathered for ``round_ns``: a block a stream of data frames, in order; other frames; losses.
+
+        A configuration frame comes before the blocks that it rules, and an empty list where nothing came.
+        """
+        gatherer = Gatherer()
+        out: list[Block | Message | Loss] = []
+        due_ns = self.clock.monotonic_ns() + round_ns
+        for found in self.polls():
+            for item in found:
+                if isinstance(item, Loss) or item.frame.type is not FrameType.DATA:
+                    out.append(item)
+                elif (block := gatherer.add(item)) is not None:
+                    out.append(block)
+            if (now_ns := self.clock.monotonic_ns()) >= due_ns:
+                due_ns = now_ns + round_ns
+                yield [*out, *gatherer.flush()]
+                out = []
+        yield [*out, *gatherer.flush()]
+
+    def site(self, flow: Flow, idcode: int) -> Site | None:
+        """The site that a stream belongs to; None where it was named by its URL only."""
+        owners = self.receivers.owners(flow, idcode)
+        return next((self.sites[index] for index in owners if self.sites[index] is not None), None)
+
     def items(self) -> Iterator[Message | Loss]:
         for found in self.polls():
             yield from found
@@ -90,3 +121,9 @@ class LiveSource:
 
     def _left_ns(self) -> int:
         return POLL_NS if self._end_ns is None else self._end_ns - self.clock.monotonic_ns()
+
+
+def _endpoint(url: str | Endpoint | Site) -> Endpoint:
+    if isinstance(url, Site):
+        return url.endpoint
+    return parse_endpoint(url) if isinstance(url, str) else url

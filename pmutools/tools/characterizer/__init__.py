@@ -1,0 +1,1 @@
+"""PMU Network Characterizer: streams through meters to figures, verdicts and a report."""
