@@ -81,12 +81,14 @@ def format_text(fmt: Format) -> str:
 def remarks(stream: StreamInventory) -> list[str]:
     """What an engineer should know about the stream, in words; empty for a clean one."""
     frames, slots = stream.frames, stream.slots
+    others = f", {slots.conflicting} with other values" if slots.conflicting else ""
     found = [
-        (slots.missing, f"{slots.missing} frames missing in {slots.gaps} gaps"),
-        (slots.duplicates, f"{slots.duplicates} frames repeat a time stamp"),
-        (slots.reordered, f"{slots.reordered} frames came after later ones"),
-        (slots.backwards, f"{slots.backwards} stamps go backwards"),
-        (stream.off_grid, f"{stream.off_grid} stamps are off the {float(stream.config.rate):g}/s grid"),
+        (slots.lost, f"{slots.lost} frames missing in {stream.gaps} gaps"),
+        (slots.duplicated, f"{slots.duplicated} frames repeat a time stamp{others}"),
+        (stream.reordered, f"{stream.reordered} frames came after later ones"),
+        (stream.backwards, f"{stream.backwards} stamps go backwards"),
+        (slots.stale, f"{slots.stale} frames are far from the stamps around them"),
+        (slots.off_grid, f"{slots.off_grid} stamps are off the {float(stream.config.rate):g}/s grid"),
         (stream.config_changes, f"{stream.config_changes} configuration changes"),
         (stream.data_error, f"STAT says data error in {stream.data_error} of {frames} frames"),
         (stream.not_synchronised, f"STAT says not synchronised in {stream.not_synchronised} of {frames} frames"),

@@ -75,8 +75,8 @@ def frames_of(batch: Batch, stat: npt.NDArray[np.uint16], rate: Fraction, counte
 
 def any_station(stat: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
     """(N,) the bits that any of the stations (N, S) sets."""
-    found = stat[:, 0].copy()
-    for number in range(1, stat.shape[1]):  # ten times faster than to reduce along the short axis
+    found = np.zeros(len(stat), np.uint16)
+    for number in range(stat.shape[1]):  # ten times faster than to reduce along the short axis
         found |= stat[:, number]
     return found
 

@@ -19,8 +19,9 @@ from pmutools.measure.counts import Counts
 from pmutools.measure.delay import DelayCounts, DelayMeter
 from pmutools.measure.floor import Course
 from pmutools.measure.quality import Events, QualityCounts, QualityMeter
-from pmutools.measure.sequence import LossCounts, LossMeter, OrderCounts, OrderMeter
-from pmutools.measure.slots import HORIZON_S, OFF_GRID_SHARE, Intake, Placed, Ring, SlotCounts, Verdict
+from pmutools.measure.sequence import LossCounts, OrderCounts
+from pmutools.measure.slotmeter import Part, SlotMeter
+from pmutools.measure.slots import HORIZON_S, OFF_GRID_SHARE, Placed, SlotCounts, Verdict
 from pmutools.measure.windows import WindowCounts, WindowMeter
 
 WAIT_NS = 200_000_000
@@ -28,7 +29,6 @@ WAIT_NS = 200_000_000
 SILENCE_NS = 10 * timebase.NS
 """Arrivals further apart than this are a silence to remember."""
 SILENCES = 32
-_LONGEST_REACH = 1 << 15
 GATHER = 512
 """So many frames are counted at once where batches are small."""
 
@@ -152,10 +152,10 @@ class StreamMeter:
         gather: int = GATHER,
     ) -> None:
         self.identity, self.config = identity, config
-        self._horizon_ns = round(horizon_s * timebase.NS)
         self._counts = StreamCounts()
         self._total = StreamCounts()
-        self._losses, self._quality = LossMeter(), QualityMeter()
+        self._slots = SlotMeter(config.rate, round(horizon_s * timebase.NS))
+        self._quality = QualityMeter()
         self._windows = WindowMeter(config.rate, phase_ns)
         self._first_ns: int | None = None
         self._last_ns: int | None = None
@@ -164,8 +164,8 @@ class StreamMeter:
         self._silences: list[Silence] = []
         self._counted, self._gather = 0, gather
         self._gathered: list[Frames] = []
-        self._regrid()
-        self._delays = DelayMeter(self._period_ns, wait_ns)
+        self._rate = config.rate
+        self._delays = DelayMeter(self._slots.period_ns, wait_ns)
         self._begin_counts()
 
     @property
@@ -173,18 +173,9 @@ class StreamMeter:
         """What happened around the frames: for the receiver to count up."""
         return self._counts.events
 
-    def _regrid(self) -> None:
-        """Slots by the configuration's rate."""
-        self._rate = self.config.rate
-        self._period_ns = timebase.NS / float(self._rate) if self._rate else timebase.NS
-        reach = int(self._horizon_ns / self._period_ns)
-        self._reach = min(max(reach, 16), _LONGEST_REACH)
-        self._intake, self._ring = Intake(self._reach, self._period_ns), Ring(self._reach)
-        self._order = OrderMeter(self._reach)
-
     def _begin_counts(self) -> None:
-        counts = self._counts
-        self._order.counts, self._losses.counts = counts.order, counts.losses
+        counts, slots = self._counts, self._slots
+        slots.counts, slots.order.counts, slots.losses.counts = counts.slots, counts.order, counts.losses
         self._delays.counts, self._windows.counts = counts.delays, counts.windows
         self._quality.counts = counts.quality
 
@@ -199,10 +190,6 @@ class StreamMeter:
         frames = frames_of(batch, stat, self._rate, self._counted)
         self._counted += len(batch)
         self._quality.add(batch, stat, frames.synchronised)
-        slots = self._counts.slots
-        slots.frames += len(batch)
-        limit_ns = OFF_GRID_SHARE * self._period_ns
-        slots.off_grid += int(np.count_nonzero(np.abs(frames.off_grid_ns) > limit_ns))
         self._note_times(frames)
         self._gathered.append(frames)
         return found + (self.drain() if sum(map(len, self._gathered)) >= self._gather else [])
@@ -212,7 +199,7 @@ class StreamMeter:
         if not self._gathered:
             return []
         frames, self._gathered = joined(self._gathered), []
-        return [seen for verdict, part in self._intake.feed(frames) for seen in self._take(verdict, part)]
+        return list(map(self._take, self._slots.feed(frames)))
 
     def _reconfigure(self, config: StreamConfig) -> list[Seen]:
         rate = self.config.rate
@@ -220,22 +207,18 @@ class StreamMeter:
         if config.rate == rate:
             return []
         found = self.drain() + self._flush()
-        self._losses.restart()
-        self._regrid()
-        self._order.counts = self._counts.order
+        self._rate = config.rate
+        self._slots.restart(self._rate)
         self._windows.restart(self._rate)
-        self._delays.restart(self._period_ns)
+        self._delays.restart(self._slots.period_ns)
         return found
 
     def _flush(self) -> list[Seen]:
         """Settle all that is still open."""
-        found = [seen for verdict, part in self._intake.flush() for seen in self._take(verdict, part)]
-        rest = self._ring.rest()
-        self._losses.add(rest.received)
-        self._losses.close()
+        found = list(map(self._take, self._slots.flush()))
         nothing = np.zeros(0, np.int64)
         none = np.zeros(0, np.uint8)
-        return [*found, Seen(nothing, nothing, nothing, nothing, none, none, rest.lost)]
+        return [*found, Seen(nothing, nothing, nothing, nothing, none, none, self._slots.close())]
 
     def _note_times(self, frames: Frames) -> None:
         if self._first_ns is None:
@@ -259,50 +242,22 @@ class StreamMeter:
                 self._silences = [self._silences[0], *sorted(rest)]
         self._last_arrival_ns = int(arrivals[-1])
 
-    def _take(self, verdict: Verdict, part: Frames) -> list[Seen]:
-        slots = self._counts.slots
-        found: list[Seen] = []
-        lost = np.zeros(0, np.int64)
-        if verdict is Verdict.STALE:
-            slots.stale += len(part)
-            return [_seen(part, np.full(len(part), STATES.index(State.STALE), np.uint8), lost)]
+    def _take(self, part: Part) -> Seen:
+        verdict, frames, placed, lost = part
+        if placed is None:
+            return _seen(frames, np.full(len(frames), STATES.index(State.STALE), np.uint8), lost)
         if verdict is Verdict.RESTART:
-            rest = self._ring.rest()
-            lost = rest.lost
-            self._losses.add(rest.received)
-            self._losses.restart()
-            self._ring.restart(int(part.slot[0]))
-            self._order.restart()
-            self._delays.restart(self._period_ns)
-            slots.epochs += 1
-        elif verdict is Verdict.OUTAGE:
-            slots.outages += 1
-            rest, gone = self._ring.skip(int(part.slot[0]), slots)
-            lost = rest.lost
-            self._losses.add(rest.received)
-            self._losses.add_lost(gone)
-        pieces, befores, changes = [], [], []
-        for rows, placed, settled in self._ring.place(part, slots):
-            self._losses.add(settled.received)
-            piece, before = part[rows], placed.before
-            found.append(_seen(piece, self._states(piece, placed), np.concatenate((lost, settled.lost))))
-            lost = lost[:0]
-            if not placed.first.all():
-                piece, before = piece[placed.first], before[placed.first]
-            pieces.append(piece)
-            befores.append(before)
-            changes.append(placed.ipdv_ns)
-        firsts = joined(pieces)
-        self._order.add(firsts.slot, np.concatenate(befores), firsts.arrival_ns)
-        self._delays.add(firsts, np.concatenate(changes))
+            self._delays.restart(self._slots.period_ns)
+        firsts = frames if placed.first.all() else frames[placed.first]
+        self._delays.add(firsts, placed.ipdv_ns)
         unseen = firsts.arrival_ns == NO_TIME
         self._windows.add(firsts.arrival_ns[~unseen] if unseen.any() else firsts.arrival_ns)
-        return found
+        return _seen(frames, self._states(frames, placed), lost)
 
     def _states(self, frames: Frames, placed: Placed) -> npt.NDArray[np.uint8]:
         """(N,) the gravest state of each frame."""
         state = np.zeros(len(frames), np.uint8)
-        state[np.abs(frames.off_grid_ns) > OFF_GRID_SHARE * self._period_ns] = STATES.index(State.OFF_GRID)
+        state[np.abs(frames.off_grid_ns) > OFF_GRID_SHARE * self._slots.period_ns] = STATES.index(State.OFF_GRID)
         state[frames.slot < placed.before] = STATES.index(State.REORDERED)
         state[frames.delay_ns > self._delays.wait_ns] = STATES.index(State.LATE)
         if not placed.first.all():
@@ -332,7 +287,7 @@ class StreamMeter:
             open_._total,
             self._rate,
             self._delays.wait_ns,
-            round(self._reach * self._period_ns),
+            round(self._slots.reach * self._slots.period_ns),
             self._first_ns,
             self._last_ns,
             self._first_arrival_ns,

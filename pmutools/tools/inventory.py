@@ -14,9 +14,12 @@ from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, FrameType, Stat
 from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.source import Block, Source
-from pmutools.measure.slots import OFF_GRID_SHARE
+from pmutools.measure.columns import any_station, frames_of
+from pmutools.measure.slotmeter import SlotMeter
+from pmutools.measure.slots import HORIZON_S, SlotCounts
 from pmutools.tools.describe import describe_station
-from pmutools.tools.slots import SlotCounts
+
+HORIZON_NS = round(HORIZON_S * timebase.NS)
 
 
 @dataclass
@@ -32,21 +35,42 @@ class StreamInventory:
     last_ns: int = 0
     first_arrival_ns: int | None = None
     last_arrival_ns: int | None = None
-    slots: SlotCounts = field(default_factory=SlotCounts)
-    off_grid: int = 0
+    backwards: int = 0
+    """Stamps that go back by more than :data:`HORIZON_NS` from one frame to the next."""
     data_error: int = 0
     not_synchronised: int = 0
     invalid: int = 0
     time_quality: dict[int, int] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self._meter = SlotMeter(self.config.rate, HORIZON_NS)
+
+    @property
+    def slots(self) -> SlotCounts:
+        """Slots by what became of them; of nothing where the configuration names no rate."""
+        return self._meter.counts
+
+    @property
+    def gaps(self) -> int:
+        """Runs of slots that no frame came for."""
+        return self._meter.losses.counts.periods.count
+
+    @property
+    def reordered(self) -> int:
+        """Frames that came after one of a later slot; copies are left out."""
+        return self._meter.order.counts.reordered
+
     def add(self, batch: Batch) -> None:
         """Count a batch that follows all before it."""
         if batch.config != self.config:
-            self.config, self.config_changes = batch.config, self.config_changes + 1
-            self.slots.restart()
+            before, self.config, self.config_changes = self.config, batch.config, self.config_changes + 1
+            if before.rate != self.config.rate:
+                self.close()
+                self._meter.restart(self.config.rate)
         if not self.frames:
-            self.first_ns = int(batch.time_ns[0])
+            self.first_ns = self.last_ns = int(batch.time_ns[0])
         self.frames += len(batch)
+        self.backwards += int(np.count_nonzero(np.diff(batch.time_ns, prepend=self.last_ns) < -HORIZON_NS))
         self.last_ns = int(batch.time_ns[-1])
         seen = batch.arrival_ns[batch.arrival_ns != NO_TIME]
         if len(seen):
@@ -58,9 +82,14 @@ class StreamInventory:
         for code, count in zip(*np.unique(batch.time_quality & 0xF, return_counts=True), strict=True):
             self.time_quality[int(code)] = self.time_quality.get(int(code), 0) + int(count)
         if rate := self.config.rate:
-            self.slots.add(timebase.slots_array(batch.time_ns, rate))
-            limit_ns = OFF_GRID_SHARE * timebase.NS / float(rate)
-            self.off_grid += int(np.count_nonzero(np.abs(timebase.grid_offset_array(batch.time_ns, rate)) > limit_ns))
+            for _ in self._meter.feed(frames_of(batch, any_station(batch.stat), rate)):
+                pass
+
+    def close(self) -> None:
+        """Count what was kept until it was clear what to make of it."""
+        for _ in self._meter.flush():
+            pass
+        self._meter.close()
 
     @property
     def measured_hz(self) -> float | None:
@@ -89,12 +118,14 @@ class StreamInventory:
             "span_s": (self.last_ns - self.first_ns) / timebase.NS,
             "first_arrival_ns": self.first_arrival_ns,
             "last_arrival_ns": self.last_arrival_ns,
-            "gaps": self.slots.gaps,
-            "missing": self.slots.missing,
-            "duplicates": self.slots.duplicates,
-            "reordered": self.slots.reordered,
-            "backwards": self.slots.backwards,
-            "off_grid": self.off_grid,
+            "gaps": self.gaps,
+            "missing": self.slots.lost,
+            "duplicates": self.slots.duplicated,
+            "conflicting": self.slots.conflicting,
+            "reordered": self.reordered,
+            "stale": self.slots.stale,
+            "backwards": self.backwards,
+            "off_grid": self.slots.off_grid,
             "config_changes": self.config_changes,
             "data_error": self.data_error,
             "not_synchronised": self.not_synchronised,
@@ -152,6 +183,8 @@ def take_inventory(source: Source) -> Inventory:
         config = block.batch.config
         key = (block.flow, config.idcode)
         streams.setdefault(key, StreamInventory(block.flow, config.idcode, config)).add(block.batch)
+    for stream in streams.values():
+        stream.close()
     tally = source.tally
     return Inventory(
         str(source.path),

@@ -303,7 +303,7 @@ def test_memory_is_bounded() -> None:
     counts = meter.result().counts
     assert counts.slots.stale > 2900
     assert counts.slots.expected < 1000
-    assert meter._ring._size == 4096
+    assert meter._slots._ring._size == 4096
     assert NO_TIME not in (counts.delays.delay.min_ns, counts.delays.delay.max_ns)
 
 

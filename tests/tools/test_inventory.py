@@ -7,20 +7,20 @@ from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.playing import START_NS, interleaved, recording, stream
 
-from pmutools.c37118 import Message
+from pmutools.c37118 import Frame, Message, Prefix, StreamConfig, encode_data
 from pmutools.c37118.constants import Stat
-from pmutools.c37118.frames import restamp
+from pmutools.c37118.frames import restamp, wire_values
 from pmutools.cli.info_text import remarks
-from pmutools.formats.source import MessageSource
+from pmutools.flow import Flow, StampSource
+from pmutools.formats.source import Block, MessageSource, gather
+from pmutools.measure.slots import SlotCounts
 from pmutools.timebase import NS, from_ns
 from pmutools.tools.inventory import Inventory, StreamInventory, take_inventory
-from pmutools.tools.slots import HOLES, NEAR, SlotCounts
 
 
 def inventory(messages: list[Message]) -> Inventory:
@@ -32,19 +32,25 @@ def only(messages: list[Message]) -> StreamInventory:
     return one
 
 
-def counted(slots: list[int], block: int = 1000) -> SlotCounts:
-    counts = SlotCounts()
-    for first in range(0, len(slots), block):
-        counts.add(np.array(slots[first : first + block], np.int64))
-    return counts
+def counted(slots: list[int], block: int = 1000) -> StreamInventory:
+    """Frames of these slots, at 50 a second, in this order and in blocks of this size."""
+    config = stream()
+    _, *messages = recording(config, len(slots), slots=slots)
+    one = StreamInventory(messages[0].flow, config.idcode, config)
+    for first in range(0, len(messages), block):
+        for item in gather(messages[first : first + block]):
+            assert isinstance(item, Block)
+            one.add(item.batch)
+    one.close()
+    return one
 
 
 # --- slots
 
 
 @given(
-    st.lists(st.integers(-30, 30), min_size=1, max_size=200),
-    st.sets(st.integers(0, 199)),
+    st.lists(st.integers(-30, 30), min_size=1, max_size=100),
+    st.sets(st.integers(0, 99)),
     st.integers(1, 50),
     st.data(),
 )
@@ -52,45 +58,53 @@ def test_slots_in_any_order_are_counted_as_a_set_would(
     shifts: list[int], dropped: set[int], block: int, data: st.DataObject
 ) -> None:
     order = sorted(range(len(shifts)), key=lambda k: (k + shifts[k], k))
-    slots = [10_000 + k for k in order if k not in dropped]
-    for at in data.draw(st.lists(st.integers(0, max(len(slots) - 1, 0)), max_size=5)):
+    slots = [10_000 + k for k in order if k not in dropped] or [10_000]
+    for at in data.draw(st.lists(st.integers(0, len(slots) - 1), max_size=5)):
         slots[at:at] = slots[at : at + 1]
-    counts = counted(slots, block)
+    one = counted(slots, block)
     unique = set(slots)
-    holes = set(range(min(unique), max(unique) + 1)) - unique if unique else set()
-    assert counts.missing == len(holes)
-    assert counts.gaps == sum(slot - 1 not in holes for slot in holes)
-    assert counts.duplicates == len(slots) - len(unique)
+    holes = set(range(min(unique), max(unique) + 1)) - unique
+    assert one.slots.lost == len(holes)
+    assert one.gaps == sum(slot - 1 not in holes for slot in holes)
+    assert one.slots.duplicated == len(slots) - len(unique)
     first_time = [slot for place, slot in enumerate(slots) if slot not in slots[:place]]
-    assert counts.reordered == sum(slot < max(first_time[: k + 1]) for k, slot in enumerate(first_time))
-    assert counts.backwards == 0
+    assert one.reordered == sum(slot < max(first_time[: k + 1]) for k, slot in enumerate(first_time))
+    assert (one.backwards, one.slots.stale) == (0, 0)
+
+
+DAY = 86_400 * 50
 
 
 @pytest.mark.parametrize(
     ("slots", "told"),
     [
-        ([], (0, 0, 0, 0, 0)),
-        ([5], (0, 0, 0, 0, 0)),
-        ([1, 2, 4, 3, 5], (0, 0, 0, 1, 0)),
-        ([1, 2, 6, 4, 7], (2, 2, 0, 1, 0)),
-        ([5, 3, 6], (1, 1, 0, 1, 0)),
-        ([1, 1, 1], (0, 0, 2, 0, 0)),
-        ([1, 2, 3, 2], (0, 0, 1, 0, 0)),
-        ([0, 5_000_000, 5_000_001], (1, 4_999_999, 0, 0, 0)),
-        ([5_000_000, 0, 1, 2, 4], (1, 1, 0, 0, 1)),
+        ([5], (0, 0, 0, 0, 0, 0)),
+        ([1, 2, 4, 3, 5], (0, 0, 0, 1, 0, 0)),
+        ([1, 2, 6, 4, 7], (2, 2, 0, 1, 0, 0)),
+        ([5, 3, 6], (1, 1, 0, 1, 0, 0)),
+        ([1, 1, 1], (0, 0, 2, 0, 0, 0)),
+        ([1, 2, 3, 2], (0, 0, 1, 0, 0, 0)),
+        ([1, 2, 3, 4, DAY, DAY + 1], (1, DAY - 5, 0, 0, 0, 0)),
+        ([1, 2, 3, 4, 2 * DAY, 2 * DAY + 1, 2 * DAY + 2, 2 * DAY + 3], (0, 0, 0, 0, 0, 0)),
+        ([DAY, 0, 1, 2, 4], (1, 1, 0, 0, 1, 1)),
+        ([DAY, DAY + 1, DAY + 2, DAY + 3, 0, 1, 2, 4], (1, 1, 0, 0, 1, 0)),
     ],
 )
 def test_known_orders(slots: list[int], told: tuple[int, ...]) -> None:
     for block in (1, 2, 100):
-        counts = counted(slots, block)
-        assert (counts.gaps, counts.missing, counts.duplicates, counts.reordered, counts.backwards) == told
+        one = counted(slots, block)
+        counts = one.slots
+        found = (one.gaps, counts.lost, counts.duplicated, one.reordered, one.backwards, counts.stale)
+        assert found == told, block
 
 
-def test_what_is_remembered_of_missing_slots_is_bounded() -> None:
-    counts = counted([3 * k for k in range(20 * HOLES)])
-    assert counts.missing == 2 * (20 * HOLES - 1)
-    assert len(counts._holes) <= HOLES
-    assert len(counted([0, NEAR + 2])._holes) == 0, "a gap too long to be filled by what comes late"
+def test_frames_of_one_stamp_and_other_values_are_told() -> None:
+    messages = recording(stream(), 20)
+    again = messages[5]._replace(
+        frame=messages[5].frame._replace(data=recording(stream(), 1, first_slot=4)[1].frame.data)
+    )
+    assert remarks(only([*messages[:6], messages[5], *messages[6:]])) == ["1 frames repeat a time stamp"]
+    assert remarks(only([*messages[:6], again, *messages[6:]])) == ["1 frames repeat a time stamp, 1 with other values"]
 
 
 # --- streams
@@ -107,7 +121,7 @@ def test_a_clean_stream_of_any_rate_has_no_remarks(rate: int, seconds: int, time
 @pytest.mark.parametrize("rate", [50, -2, -7])
 def test_missing_frames_are_counted_at_any_rate(rate: int) -> None:
     one = only(recording(stream(rate=rate), 6, slots=[0, 1, 2, 5, 6, 9]))
-    assert (one.slots.gaps, one.slots.missing) == (2, 4)
+    assert (one.gaps, one.slots.lost) == (2, 4)
     assert remarks(one) == ["4 frames missing in 2 gaps"]
 
 
@@ -117,7 +131,7 @@ def test_an_undefined_rate_makes_no_slots() -> None:
     undefined = stream(rate=0)
     assert undefined.rate == Fraction(0)
     one = only([message._replace(config=undefined) for message in messages])
-    assert (one.frames, one.slots, one.off_grid) == (10, SlotCounts(), 0)
+    assert (one.frames, one.slots, remarks(one)) == (10, SlotCounts(), [])
     assert one.to_json()["rate_hz"] == 0
 
 
@@ -143,7 +157,7 @@ def test_stamps_off_the_grid_are_counted() -> None:
         soc, fracsec = from_ns(START_NS + place * NS // 50 + 7_000_000, 1_000_000)
         frame = messages[place].frame
         messages[place] = messages[place]._replace(frame=frame._replace(data=restamp(frame.data, soc, fracsec)))
-    assert only(messages).off_grid == 10
+    assert only(messages).slots.off_grid == 10
     assert "10 stamps are off the 50/s grid" in remarks(only(messages))
 
 
@@ -151,7 +165,7 @@ def test_a_changed_configuration_is_counted_and_leaves_no_gap() -> None:
     flow = recording(stream(), 0)[0].flow
     messages = recording(stream(), 10, flow=flow) + recording(stream(rate=25), 10, first_slot=900, flow=flow)
     one = only(messages)
-    assert (one.config_changes, one.slots.missing, one.frames) == (1, 0, 20)
+    assert (one.config_changes, one.slots.lost, one.frames) == (1, 0, 20)
 
 
 def test_streams_are_kept_apart_by_flow_and_idcode() -> None:
@@ -187,5 +201,17 @@ def test_an_hour_of_frames_needs_little_memory() -> None:
     finally:
         tracemalloc.stop()
     assert told.streams[0].frames == 60_000
-    assert told.streams[0].slots == SlotCounts(_low=told.streams[0].slots._low, _high=told.streams[0].slots._high)
+    assert remarks(told.streams[0]) == []
     assert peak < 30e6, "a block, not the file"
+
+
+def test_a_stream_without_stations_is_counted() -> None:
+    """NUM_PMU 0: frames of a prefix and a CHK."""
+    config = StreamConfig(7, (), 50)
+    frames = []
+    for k in range(10):
+        soc, fracsec = from_ns(START_NS + k * NS // 50, 1_000_000)
+        frames.append(encode_data(wire_values(config, Prefix(0xAA01, config.frame_size, 7, soc, 0, fracsec), [])))
+    flow = Flow("udp", "192.0.2.7:4713", "192.0.2.1:4713")
+    one = only([Message(Frame(frame, None, StampSource.CAPTURE, 0), flow, config) for frame in frames])
+    assert (one.frames, one.slots.received, one.slots.lost) == (10, 10, 0)
