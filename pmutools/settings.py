@@ -83,7 +83,8 @@ class Ini:
             known = section.kind in families if section.argument else section.name in names
             if not known:
                 shown = [f"{name[:-2]} NAME" if name.endswith(" *") else name for name in names]
-                raise section.where.error(f"unknown section; {suggestion(section.name, shown)}")
+                written = f"{section.kind} NAME" if section.argument else section.name
+                raise section.where.error(f"unknown section; {suggestion(written, shown)}")
 
     def family(self, kind: str) -> tuple[Section, ...]:
         """All ``[kind X]``."""

@@ -5,11 +5,13 @@ The reader, the characterizer and the controller take the same file; each leaves
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from pmutools.c37118.config import StreamConfig
 from pmutools.errors import SettingsError, SourceError
-from pmutools.net.endpoint import Endpoint, parse_endpoint
+from pmutools.net.endpoint import Endpoint, Scheme, parse_endpoint
 from pmutools.parsers import choice, integer, number, parsed_by, words
 from pmutools.settings import Ini, Section, fill, parse_ini
 
@@ -67,6 +69,43 @@ class Site:
         """The URL with the stream's IDCODE in it."""
         return replace(self.url, idcode=self.stream)
 
+    def stations(self, config: StreamConfig) -> tuple[int, ...]:
+        """The numbers of the stations that are this PMU: one, or all where it names none; () where it is not there."""
+        names = [station.name for station in config.stations]
+        if self.station is None:
+            return tuple(range(len(names)))
+        return (names.index(self.station),) if self.station in names else ()
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSites:
+    """One stream, which is received once, and the sites that are in it: several of a concentrator's."""
+
+    endpoint: Endpoint
+    sites: tuple[Site, ...]
+
+    @property
+    def name(self) -> str:
+        """The site's name; of several, all of them with a ``+`` between."""
+        return "+".join(site.name for site in self.sites)
+
+    @property
+    def rate(self) -> int | None:
+        """Frames per second that are expected; None where no site says it."""
+        return next((site.rate for site in self.sites if site.rate is not None), None)
+
+
+def streams_of(sites: Iterable[Site]) -> tuple[StreamSites, ...]:
+    """Each endpoint once, in the order of the file, with its sites.
+
+    What receives from ``[stream.endpoint for stream in streams]`` tells of streams by their places in this tuple
+    (:meth:`pmutools.net.receiver.Receivers.owners`).
+    """
+    found: dict[Endpoint, list[Site]] = {}
+    for site in sites:
+        found.setdefault(site.endpoint, []).append(site)
+    return tuple(StreamSites(endpoint, tuple(members)) for endpoint, members in found.items())
+
 
 def read_ini(path: str | Path) -> tuple[Ini, str]:
     """An initialisation file's sections, and its text. Raises SourceError where it cannot be read."""
@@ -101,7 +140,7 @@ def load_sites(path: str | Path) -> tuple[Site, ...]:
 
 
 def _check_apart(sections: tuple[Section, ...], sites: tuple[Site, ...]) -> None:
-    """Raise SettingsError for a PMU that would be given the frames of another, or that has two IDCODEs."""
+    """Raise SettingsError for a PMU that has two IDCODEs, or that clashes with one above it."""
     for index, (section, site) in enumerate(zip(sections, sites, strict=True)):
         if site.idcode is not None and site.url.idcode not in (None, site.idcode):
             raise section.entries["idcode"].where.error(f"{site.idcode}, but the url says {site.url.idcode}; keep one")
@@ -109,11 +148,47 @@ def _check_apart(sections: tuple[Section, ...], sites: tuple[Site, ...]) -> None
             if _overlap(site, other):
                 problem = f"{site.url} gives it the frames of {other.name} too"
                 raise section.where.error(f"{problem}; tell the two apart by idcode, station or ?source=")
+            if _same_port(site.url, other.url):
+                problem = f"{site.url} and {other.url} of {other.name} are one port of this machine"
+                raise section.entries["url"].where.error(f"{problem}; write the same host in both")
+            if site.endpoint == other.endpoint:
+                _check_alike(section, sections[sites.index(other)])
+
+
+def _check_alike(section: Section, other: Section) -> None:
+    """Raise SettingsError for sites of one stream that say different things of it."""
+    for key in ("rate", "config"):
+        one, two = section.entries.get(key), other.entries.get(key)
+        if one is None or two is None or one.text == two.text:
+            continue
+        if one.where.section != section.name:  # of [DEFAULT]: the other one is what stands out
+            one, two, other = two, one, section
+        raise one.where.error(f"{one.text}, but {other.argument} in the same stream has {two.text}; keep one")
 
 
 def _overlap(site: Site, other: Site) -> bool:
+    """Whether frames of one PMU would be taken for the other's."""
     one, two = site.url, other.url
     if (one.scheme, one.host, one.port) != (two.scheme, two.host, two.port):
         return False
     pairs = ((site.stream, other.stream), (site.station, other.station), (one.source, two.source))
     return all(None in pair or pair[0] == pair[1] for pair in pairs)
+
+
+_EVERY_HOST = ("0.0.0.0", "::")
+
+
+def _same_port(one: Endpoint, two: Endpoint) -> bool:
+    """Whether one is bound to every local address and the other to one of them, at the same port: only one can be."""
+    (host, port), (other, other_port) = _bound(one), _bound(two)
+    if not port or port != other_port or host == other or (":" in host) != (":" in other):
+        return False
+    return host in _EVERY_HOST or other in _EVERY_HOST
+
+
+def _bound(url: Endpoint) -> tuple[str, int]:
+    """Where datagrams of an endpoint are received; port 0 where the system chooses, or there are none."""
+    if url.scheme is Scheme.UDP:
+        return url.host, url.port
+    every = _EVERY_HOST[":" in url.host]
+    return url.data_host or every, url.data_port or 0

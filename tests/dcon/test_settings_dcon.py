@@ -171,9 +171,9 @@ MISTAKES = {
         "dcon.ini:12: [pmu N2] voltage: 'VA,VB' is neither one positive-sequence channel nor three phases VA,VB,VC",
     ),
     "different rates": (
-        "side = south",
-        "side = south\nrate = 30",
-        "dcon.ini:18: [pmu S1] rate: 30 frames/s, but N1 has 60; the controller needs one rate",
+        "voltage = V1LPM",
+        "rate = 30",
+        "dcon.ini:12: [pmu N2] rate: 30 frames/s, but N1 has 60; the controller needs one rate",
     ),
     "a rate that the filter cannot have": (
         "rate = 60",
