@@ -7,7 +7,7 @@ import sys
 import click
 
 from pmutools.cli.shell import Exit, Talk, common
-from pmutools.cli.sources import DURATION, TARGET, Watched, open_target
+from pmutools.cli.sources import DURATION, TARGET, Watched, is_live, open_target
 from pmutools.timebase import NS
 
 LIVE_NS = 5 * NS
@@ -21,20 +21,21 @@ LIVE_NS = 5 * NS
 def command(target: str, duration_ns: int | None, as_json: bool, quiet: bool, verbose: int) -> int:
     """Streams, stations, channels, rate, span, gaps and defects of a FILE or live URL.
 
-    A URL is read for --duration seconds (5 by default). Exit code 3 says that some bytes were lost or undecodable.
+    A URL is read for --duration seconds (5 by default) or until Ctrl-C; what happens to its connection is told on
+    stderr. Exit code 3 says that some bytes were lost or undecodable.
     """
     import json
 
     from pmutools.tools.inventory import take_inventory
 
     talk = Talk(quiet, verbose)
-    if duration_ns is None and "://" in target:
+    if duration_ns is None and is_live(target):
         duration_ns = LIVE_NS
-    with open_target(target, duration_ns) as source:
-        inventory = take_inventory(Watched(source, talk))
+    with open_target(target, duration_ns, talk, verbose) as opened:
+        inventory = take_inventory(Watched(opened.source, talk, target), target)
     if not inventory.frames and not inventory.skipped:
-        talk.complain(f"pmu info: {target}: no C37.118 frames found in {inventory.bytes_in} bytes of payload")
-        return Exit.FAILED
+        talk.complain(f"pmu info: {target}: {opened.why()}")
+        return Exit.INTERRUPTED if opened.stopped() else Exit.FAILED
     if as_json:
         json.dump(inventory.to_json(), sys.stdout, indent=2)
         sys.stdout.write("\n")
@@ -42,4 +43,6 @@ def command(target: str, duration_ns: int | None, as_json: bool, quiet: bool, ve
         from pmutools.cli.info_text import show
 
         show(inventory)
+    if opened.stopped():
+        return Exit.INTERRUPTED
     return Exit.INCOMPLETE if inventory.damaged else Exit.DONE

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
 
 from pmutools import parsers
-from pmutools.cli.shell import Parsed, Talk
+from pmutools.cli.shell import Parsed, Talk, interruptible
 from pmutools.errors import SettingsError
 from pmutools.timebase import NS
 
@@ -45,19 +45,40 @@ DURATION = click.option(
 )
 
 
+def is_live(target: str) -> bool:
+    """Whether the user named an endpoint, not a file."""
+    return "://" in target
+
+
+class Opened(NamedTuple):
+    """What the user named, open for reading."""
+
+    source: Source
+    why: Callable[[], str]
+    """Why it has given no frames, as part of a sentence."""
+    stopped: Callable[[], bool] = lambda: False
+    """Whether the user has stopped it: reading then ends."""
+
+
 @contextmanager
-def open_target(target: str, duration_ns: int | None) -> Iterator[Source]:
-    """A file's source, cut to ``duration_ns`` of stream time, or a live one that ends after that wall time."""
-    if "://" in target:
+def open_target(target: str, duration_ns: int | None, talk: Talk, verbose: int = 0) -> Iterator[Opened]:
+    """A file, cut to ``duration_ns`` of stream time, or an endpoint, read for that wall time or until Ctrl-C.
+
+    The news of an endpoint are told as they come.
+    """
+    if is_live(target):
+        from pmutools.cli.news import News
         from pmutools.tools.live import LiveSource
 
-        with LiveSource([target], duration_ns=duration_ns) as live:
-            yield live
+        news = News(talk, verbose)
+        with interruptible() as stop, LiveSource([target], duration_ns=duration_ns, tell=news, stop=stop) as live:
+            yield Opened(live, news.reasons.why, stop)
         return
     from pmutools.formats import open_source
 
     source = open_source(target)
-    yield source if duration_ns is None else _Cut(source, duration_ns)
+    cut = source if duration_ns is None else _Cut(source, duration_ns)
+    yield Opened(cut, lambda: f"no C37.118 frames found in {source.tally.fed} bytes of payload")
 
 
 class _Through:
@@ -89,11 +110,11 @@ class _Cut(_Through):
 
 
 class Watched(_Through):
-    """A source whose progress is shown while it is read."""
+    """A source whose progress is shown while it is read; ``name`` is what the user calls it."""
 
-    def __init__(self, source: Source, talk: Talk) -> None:
+    def __init__(self, source: Source, talk: Talk, name: str = "") -> None:
         super().__init__(source)
-        self._talk = talk
+        self._talk, self._name = talk, name or str(source.path)
 
     def items(self) -> Iterator[Message | Loss]:
         return self._watched(self.source.items())
@@ -109,7 +130,7 @@ class Watched(_Through):
                 frames += len(item.batch) if hasattr(item, "batch") else 1
                 if frames >= told + TOLD_FRAMES:
                     told = frames
-                    self._talk.progress(f"{self.source.path}: {frames} frames")
+                    self._talk.progress(f"{self._name}: {frames} frames")
         finally:
             self._talk.progress("")
 

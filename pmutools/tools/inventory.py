@@ -168,8 +168,8 @@ class Inventory:
         }
 
 
-def take_inventory(source: Source) -> Inventory:
-    """Read a source to its end and count what is in it."""
+def take_inventory(source: Source, name: str = "") -> Inventory:
+    """Read a source to its end and count what is in it; ``name`` is what the user calls it, by default its path."""
     streams: dict[tuple[Flow, int], StreamInventory] = {}
     for item in source.blocks():
         if isinstance(item, Loss):
@@ -187,7 +187,7 @@ def take_inventory(source: Source) -> Inventory:
         stream.close()
     tally = source.tally
     return Inventory(
-        str(source.path),
+        name or str(source.path),
         source.kind,
         list(streams.values()),
         dict(tally.frames),

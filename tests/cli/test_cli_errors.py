@@ -194,7 +194,7 @@ def test_debug_shows_where_and_changes_nothing_else(pmu: Pmu, arguments: tuple[s
 def test_an_unforeseen_error_is_one_line_too(pmu: Pmu, monkeypatch: pytest.MonkeyPatch) -> None:
     import pmutools.tools.inventory
 
-    def broken(source: object) -> None:
+    def broken(*arguments: object) -> None:
         raise ZeroDivisionError("two\nlines")
 
     monkeypatch.setattr(pmutools.tools.inventory, "take_inventory", broken)

@@ -246,6 +246,61 @@ def test_a_wrong_idcode_is_told_with_what_was_asked_for(source: Path, tmp_path: 
         ended(player)
 
 
+def refused() -> tuple[str, str]:
+    """A URL that nothing serves, and what is said of it."""
+    url = f"tcp://127.0.0.1:{free_port()}"
+    return url, f"{url}: refused: nothing serves this port; is the device on, and the port right?"
+
+
+def test_info_of_a_port_that_nothing_serves_says_so() -> None:
+    url, reason = refused()
+    result = run_pmu("info", url, "--duration", 0.3)
+    assert result.code == 1
+    assert result.out == ""
+    assert result.err.splitlines() == [reason.replace(": refused", ": failed: refused"), f"pmu info: {reason}"]
+    assert run_pmu("info", url, "--duration", 0.3, "--quiet").complaint == f"pmu info: {reason}"
+
+
+def test_dump_of_a_port_that_nothing_serves_says_so_once() -> None:
+    """It is tried again meanwhile, and the same news are no news."""
+    url, reason = refused()
+    result = run_pmu("dump", url, "--duration", 1.2)
+    assert result.code == 1
+    assert result.err.splitlines() == [reason.replace(": refused", ": failed: refused"), f"pmu dump: {reason}"]
+    told = run_pmu("dump", url, "--duration", 1.2, "-v").err.splitlines()
+    assert len(told) > 2 and set(told[:-1]) == {result.err.splitlines()[0]}
+
+
+def test_info_that_is_interrupted_tells_what_it_has_seen() -> None:
+    port = free_udp_port()
+    url = f"udp://127.0.0.1:{port}"
+    with started("info", url, "--duration", 60, "-v") as info:
+        wait_for_udp(port, info)
+        assert info.stderr is not None
+        assert "bound: receive buffer" in info.stderr.readline()
+        send(port, [message.frame.data for message in recording(stream(7, name="ALPHA"), 10)])
+        while "streaming" not in (line := info.stderr.readline()):
+            assert line
+        info.send_signal(signal.SIGINT)
+        result = ended(info)
+    assert result.code == 130, result.err
+    assert result.out.startswith(f"{url}  live, ")
+    assert "ALPHA" in result.out
+
+
+def test_dump_of_a_live_stream_shows_frames_as_they_come() -> None:
+    port = free_udp_port()
+    with started("dump", f"udp://127.0.0.1:{port}") as dump:
+        wait_for_udp(port, dump)
+        send(port, [message.frame.data for message in recording(stream(), 3)])
+        assert dump.stdout is not None
+        kinds = [dump.stdout.readline().split()[2] for _ in range(4)]
+        dump.send_signal(signal.SIGINT)
+        result = ended(dump)
+    assert kinds == ["cfg2", "data", "data", "data"]
+    assert (result.code, result.err) == (130, "")
+
+
 def test_info_and_dump_of_a_live_stream(source: Path) -> None:
     port = free_port()
     with started("play", source, "--listen", f"tcp://127.0.0.1:{port}", "--loop", 0, "--speed", 5) as player:
