@@ -13,6 +13,7 @@ COMMANDS = {
     "dump": ("pmutools.cli.dump", "Every frame, one a line."),
     "convert": ("pmutools.cli.convert", "Recordings to another format."),
     "synth": ("pmutools.cli.synth", "A recording made by a simulated grid and its PMUs."),
+    "ini": ("pmutools.cli.ini", "A starter initialisation file from live streams."),
     "play": ("pmutools.cli.play", "Stream a recording live, as any number of PMUs."),
     "ctl": ("pmutools.cli.ctl", "Control a running player."),
     "read": ("pmutools.cli.read", "Read live streams and log them."),

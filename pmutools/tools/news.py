@@ -32,6 +32,11 @@ class Reasons:
             if known is None or known.kind is not LinkKind.FOREIGN or event.kind not in _AFTER_FOREIGN:
                 self._last[place] = event
 
+    def refused(self, place: int) -> bool:
+        """Whether the last that was heard is that no connection could be made."""
+        event = self._last.get(place)
+        return event is not None and event.kind is LinkKind.FAILED
+
     def why(self, place: int = 0) -> str:
         """Why nothing came of an endpoint, as part of a sentence, with what to do."""
         event = self._last.get(place)
