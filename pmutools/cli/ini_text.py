@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from pmutools.c37118.config import Station
-from pmutools.cli.info_text import format_text, remarks
+from pmutools.cli.info_text import CHANNELS_SHOWN, format_text, remarks
 from pmutools.cli.shell import visible
 from pmutools.errors import SettingsError
 from pmutools.net.endpoint import Endpoint, Scheme
@@ -18,6 +19,7 @@ from pmutools.timebase import NS, format_utc
 from pmutools.tools.guess import nominal_kv
 from pmutools.tools.survey import Survey, SurveyedEndpoint, SurveyedStream
 
+WIDTH = 110
 COLUMN = 40
 """Remarks on a line begin here."""
 FAR_NS = 2 * NS
@@ -136,7 +138,7 @@ def ini_text(survey: Survey, sections: list[Section]) -> str:
     for endpoint in survey.endpoints:
         lines += ["", *_endpoint_lines(endpoint)]
         for stream in endpoint.streams:
-            lines += ["", *(f"; {visible(text)}" for text in _stream_comments(stream))]
+            lines += ["", *_comments(_stream_comments(stream))]
             for number, section in enumerate(section for section in sections if section.stream is stream):
                 lines += [*([""] if number else []), *_section_lines(section, rate)]
     return "\n".join(lines) + "\n"
@@ -150,6 +152,13 @@ def _head(survey: Survey) -> Iterator[str]:
         yield f"; {survey.unlisted} more streams came; they are not listed."
     if survey.own_drops:
         yield f"; {survey.own_drops} datagrams were lost in this machine's receive buffer."
+
+
+def _comments(texts: Iterable[str]) -> Iterator[str]:
+    for text in texts:
+        shown = visible(text)
+        indent = " " * (len(shown) - len(shown.lstrip()))
+        yield from textwrap.wrap(shown, WIDTH, initial_indent="; ", subsequent_indent=f"; {indent}")
 
 
 def _common_rate(sections: list[Section]) -> str | None:
@@ -234,7 +243,7 @@ def _channels(station: Station) -> str:
 
 
 def _section_lines(section: Section, rate: str | None) -> Iterator[str]:
-    yield from (f"; {visible(text)}" for text in section.comments)
+    yield from _comments(section.comments)
     off = ";" if section.problem else ""
     if section.problem:
         yield f"; * {section.problem}"
@@ -247,7 +256,9 @@ def _section_lines(section: Section, rate: str | None) -> Iterator[str]:
         yield f"{line:<{COLUMN}}; {visible(note)}" if note else line
     if "voltage" not in section.keys:
         names = [channel.name for channel in section.stream.stations[section.station].phasors if channel.kind == "V"]
-        yield f";voltage = ; one positive-sequence channel, or three phases, of: {visible(', '.join(names) or 'none')}"
+        some = ", ".join(names[:CHANNELS_SHOWN]) + (", ..." if len(names) > CHANNELS_SHOWN else "")
+        yield from _comments((f"one positive-sequence channel, or three phases, of: {some or 'none'}",))
+        yield ";voltage ="
     if text := _level(section):
         yield text
 
