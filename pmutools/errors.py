@@ -9,6 +9,7 @@
     │   └── ConfigError                a configuration that cannot describe a stream, or none for this IDCODE
     ├── EncodeError     (ValueError)   our caller asked for a frame that the standard cannot carry
     ├── SourceError     (OSError)      a file or endpoint that cannot be read or written
+    │   └── StreamTimeout  (TimeoutError)  no data came for as long as the caller wanted to wait
     └── SettingsError   (ValueError)   a user's option, key or value
 
 Each also inherits the standard library's type, so that callers who do not know us can catch it.
@@ -59,6 +60,10 @@ class EncodeError(PmuError, ValueError):
 
 class SourceError(PmuError, OSError):
     """A file or an endpoint that cannot be read or written; the message names it."""
+
+
+class StreamTimeout(SourceError, TimeoutError):
+    """No data came for as long as the caller wanted to wait; the message says why, as far as that is known."""
 
 
 class SettingsError(PmuError, ValueError):

@@ -22,7 +22,7 @@ LAYERS = [
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],
     ["pmutools.grid", "pmutools.formats", "pmutools.measure", "pmutools.sites"],
     ["pmutools.tools"],
-    ["pmutools.cli"],
+    ["pmutools.cli", "pmutools.stream"],
     # the controller
     ["dcon", "dcon.limiter"],
     ["dcon.core"],

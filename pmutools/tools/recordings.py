@@ -14,10 +14,15 @@ from pmutools.sites import Site
 
 
 def open_recordings(
-    paths: Sequence[str | Path], *, data_rate: int | None = None, fnom_hz: float | None = None
+    paths: Sequence[str | Path],
+    *,
+    configs: Iterable[StreamConfig] = (),
+    data_rate: int | None = None,
+    fnom_hz: float | None = None,
 ) -> Source:
     """The recordings merged on time; arguments, SourceError and SettingsError as of :func:`open_source`."""
-    sources = [open_source(path, data_rate=data_rate, fnom_hz=fnom_hz) for path in paths]
+    known = tuple(configs)
+    sources = [open_source(path, configs=known, data_rate=data_rate, fnom_hz=fnom_hz) for path in paths]
     if len(sources) == 1:
         return sources[0]
     from pmutools.formats.folder import MergedSource
