@@ -3,7 +3,7 @@
 In ``README.md`` and ``docs/``:
 
 - every ```` ```python ```` block runs, in a folder that has ``captures``; a ```` ```text ```` block right after it is
-  what it prints;
+  what it prints; the command of ``<!-- beside: COMMAND -->`` above it runs meanwhile;
 - every ``$ `` line of a ```` ```console ```` block is a command that click accepts;
 - under ``<!-- run -->`` (``<!-- run: slow -->``) they are run, one after the other, and print what the block says.
   A command that ends with ``&`` runs beside those after it, which wait until its
@@ -24,13 +24,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import pytest
+from support.live import free_ports
 
 from dcon.cli import dcon
 from dcon.core.rows import CORE
@@ -52,6 +53,8 @@ sys.path.insert(0, str(DOCS))
 from generate import GENERATORS, display  # noqa: E402
 from hooks import MARKER, filled  # noqa: E402
 
+BESIDE = "beside: "
+
 
 class Fence(NamedTuple):
     """A code block: the comment right above it, its language, its text, and the block right after it, if any."""
@@ -63,7 +66,7 @@ class Fence(NamedTuple):
 
 
 _FENCE = re.compile(
-    r"^(?:<!-- ([\w: ]+) -->\n)?```(\w*)\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL
+    r"^(?:<!-- ([^\n]+) -->\n)?```(\w*)\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL
 )
 
 
@@ -97,7 +100,10 @@ def test_markers_and_generators_are_the_same() -> None:
 def test_a_page_has_no_marker_that_is_misspelt() -> None:
     for page, path in PAGES.items():
         comments = re.findall(r"<!--.*?-->", path.read_text(encoding="utf-8"))
-        strange = [c for c in comments if not MARKER.fullmatch(c) and c not in ("<!-- run -->", "<!-- run: slow -->")]
+        plain = ("<!-- run -->", "<!-- run: slow -->")
+        strange = [
+            c for c in comments if not MARKER.fullmatch(c) and c not in plain and not c.startswith(f"<!-- {BESIDE}")
+        ]
         assert not strange, page
 
 
@@ -138,8 +144,11 @@ PYTHON = [(page, number) for page in PAGES for number, fence in enumerate(fences
 
 @pytest.mark.parametrize(("page", "number"), PYTHON, ids=[f"{page}-{number}" for page, number in PYTHON])
 def test_python_examples_run(page: str, number: int, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fence = fences(page)[number]
-    exec(compile(fence.text, f"{page}, block {number}", "exec"), {"__name__": "example"})
+    fence, ports = fences(page)[number], ports_to_use()
+    command = fence.marker.removeprefix(BESIDE) if fence.marker.startswith(BESIDE) else None
+    code = compile(replaced(fence.text, ports), f"{page}, block {number}", "exec")
+    with beside(replaced(command, ports)) if command else nullcontext():
+        exec(code, {"__name__": "example"})
     if fence.after is not None:
         output = capsys.readouterr().out
         assert said(fence.after.strip(), output), output
@@ -161,13 +170,9 @@ def said(printed: str, output: str) -> bool:
     return re.fullmatch(pattern, output.strip(), re.DOTALL) is not None
 
 
-def free_ports() -> dict[str, str]:
+def ports_to_use() -> dict[str, str]:
     """A port that nobody has for each of :data:`PORTS`."""
-    with ExitStack() as stack:
-        taken = [stack.enter_context(socket.socket()) for _ in PORTS]
-        for sock in taken:
-            sock.bind(("127.0.0.1", 0))
-        return {port: str(sock.getsockname()[1]) for port, sock in zip(PORTS, taken, strict=True)}
+    return dict(zip(PORTS, map(str, free_ports(len(PORTS))), strict=True))
 
 
 def replaced(text: str, words: dict[str, str]) -> str:
@@ -214,7 +219,7 @@ def run_examples(page: str, marker: str) -> None:
 
 
 def run_block(page: str, fence: Fence, stack: ExitStack) -> None:
-    ports = free_ports()
+    ports = ports_to_use()
     back = {free: port for port, free in ports.items()}
     for shown, printed in steps(fence.text):
         command = replaced(shown, ports)

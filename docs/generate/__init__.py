@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import commands, controller, impairments, measures, player, streams, structure, studies
+from generate import api, commands, controller, impairments, measures, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
@@ -15,5 +15,6 @@ GENERATORS: dict[str, Callable[[], str]] = {
     **measures.GENERATORS,
     **studies.GENERATORS,
     **commands.GENERATORS,
+    **api.GENERATORS,
 }
 """Markdown by the name that a marker gives."""

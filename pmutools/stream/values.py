@@ -18,7 +18,7 @@ from pmutools.c37118.constants import DataError, Stat, stat_data_error
 from pmutools.c37118.demux import Message
 from pmutools.c37118.frames import Data, unpack_data
 from pmutools.c37118.layout import layout_of
-from pmutools.flow import Flow
+from pmutools.flow import Flow, StampSource
 from pmutools.formats.columns import columns_of, quantities
 from pmutools.parsers import suggestion
 from pmutools.sites import Site
@@ -56,14 +56,16 @@ class StationValues:
 
     __slots__ = ("_data", "_names", "number")
 
+    number: int
+    """Its place in the frame, from 0."""
+
     def __init__(self, data: Data, number: int) -> None:
-        self._data = data
+        self._data, self.number = data, number
         self._names = _names(data.config)[number]
-        self.number = number
-        """Its place in the frame, from 0."""
 
     @property
     def name(self) -> str:
+        """As sent, trimmed; ``#2`` after what comes again."""
         return self._names.station
 
     @property
@@ -132,18 +134,24 @@ def _polar(value: complex) -> str:
 class StreamFrame:
     """One data frame: when, from whom, and its stations. Nothing is decoded before it is asked for."""
 
-    __slots__ = ("_data", "_sites", "_time_ns", "arrival_ns", "config", "flow", "wire")
+    __slots__ = ("_data", "_sites", "_time_ns", "arrival_ns", "config", "flow", "stamp_source", "wire")
+
+    arrival_ns: int | None
+    """When it arrived: POSIX UTC, ns; unknown where nobody saw it."""
+    stamp_source: StampSource
+    """Who took the arrival."""
+    config: StreamConfig
+    """The configuration that it was sent by."""
+    flow: Flow
+    """Where it came from and to."""
+    wire: bytes
+    """The frame as sent."""
 
     def __init__(self, message: Message, sites: tuple[Site, ...] = ()) -> None:
-        frame, flow, config = message
+        frame, self.flow, config = message
         assert config is not None, "data frames have a configuration"
-        self.wire: bytes = frame.data
-        """The frame as sent."""
-        self.config: StreamConfig = config
-        self.flow: Flow = flow
-        """Where it came from and to."""
-        self.arrival_ns: int | None = frame.arrival_ns
-        """POSIX UTC, ns; None where nobody saw it arrive."""
+        self.config, self.wire = config, frame.data
+        self.arrival_ns, self.stamp_source = frame.arrival_ns, frame.stamp_source
         self._sites = sites
         self._data: Data | None = None
         self._time_ns: int | None = None
@@ -174,7 +182,7 @@ class StreamFrame:
 
     @property
     def delay_ns(self) -> int | None:
-        """Arrival less stamp: estimation, network and the two clocks' difference; None without an arrival."""
+        """Arrival less stamp: estimation, network and the two clocks' difference; unknown without an arrival."""
         return None if self.arrival_ns is None else self.arrival_ns - self.time_ns
 
     @property
@@ -266,6 +274,7 @@ class StreamBatch:
     """Data frames of one stream that came together, as columns of numpy arrays."""
 
     flow: Flow
+    """Where they came from and to."""
     batch: Batch
     """All columns by number: see :class:`pmutools.c37118.batch.Batch`."""
     sites: tuple[Site, ...] = ()
@@ -276,10 +285,12 @@ class StreamBatch:
 
     @property
     def idcode(self) -> int:
+        """Of the stream."""
         return self.batch.config.idcode
 
     @property
     def config(self) -> StreamConfig:
+        """The configuration that the frames were sent by."""
         return self.batch.config
 
     @property
