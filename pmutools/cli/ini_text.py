@@ -190,7 +190,7 @@ def _stream_comments(stream: SurveyedStream) -> Iterator[str]:
     rate = f"{float(config.rate):g} frames/s" if config.rate else "rate undefined"
     if (measured := inventory.measured_hz) is not None:
         rate += f" (measured {measured:.3f})"
-    where = ", ".join(list(stream.senders)[:4])
+    where = ", ".join(list(stream.senders)[:4]) or stream.host
     frames = f"{inventory.frames} data frames of {config.frame_size} bytes"
     yield f"IDCODE {inventory.idcode} from {where}: {config.kind.name}, {rate}, {frames}"
     middle, most = stream.delay.quantiles_ns((0.5, 0.99))

@@ -46,7 +46,7 @@ class SurveyedStream:
     delay: Histogram = field(default_factory=Histogram)
     """Arrival less stamp."""
     senders: dict[str, None] = field(default_factory=dict)
-    """Addresses that it comes from, or that it is connected to."""
+    """Addresses that its data come from."""
 
     def __post_init__(self) -> None:
         self._begin()
@@ -191,20 +191,22 @@ class Surveyor:
             place = places[0]
         if place is None:
             return
-        key = (place, _host(item.flow), config.idcode)
+        endpoint = self.endpoints[place].endpoint
+        host = endpoint.host if endpoint.scheme.commanded else _host(item.flow)  # whose data may come from elsewhere
+        key = (place, host, config.idcode)
         stream = self._streams.get(key)
         if stream is None:
             if len(self._streams) >= STREAMS:
                 if len(self._unlisted) < STREAMS * STREAMS:
                     self._unlisted.add(key)
                 return
-            stream = self._streams[key] = SurveyedStream(key[1], StreamInventory(item.flow, config.idcode, config))
+            stream = self._streams[key] = SurveyedStream(host, StreamInventory(item.flow, config.idcode, config))
             self.endpoints[place].streams.append(stream)
-        self._unconfigured.pop(key, None)
-        if len(stream.senders) < SENDERS:
-            stream.senders[item.flow.source] = None
+        self._unconfigured.pop((place, _host(item.flow), config.idcode), None)
         if isinstance(item, Block):
             stream.add(item.batch, now_ns)
+            if len(stream.senders) < SENDERS:
+                stream.senders[item.flow.source] = None
 
     def settled(self, now_ns: int) -> bool:
         """Whether every endpoint has shown a configuration and data for a while, or has refused."""

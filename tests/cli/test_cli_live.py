@@ -308,6 +308,7 @@ def test_info_and_dump_of_a_live_stream(source: Path) -> None:
         url = f"tcp://127.0.0.1:{port}?idcode=7"
         told = run_pmu("info", url, "--duration", 1, "--json")
         assert told.code == 0, told.err
+        assert told.json["path"] == url
         assert told.json["streams"][0]["frames"] > 20
         lines = run_pmu("dump", url, "--duration", 1, "--json")
         assert lines.code == 0, lines.err

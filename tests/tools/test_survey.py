@@ -8,12 +8,16 @@ from typing import Any
 
 import pytest
 from support.live import data_frame, free_udp_port, stream
+from support.playing import recording
 
 from pmutools.c37118 import StreamConfig, encode_config
 from pmutools.clock import VirtualClock
+from pmutools.flow import Flow
+from pmutools.formats.source import Block, gather
 from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.net.endpoint import parse_endpoint
 from pmutools.timebase import NS
-from pmutools.tools.survey import LOOK_NS, PATIENCE_NS, Survey, survey
+from pmutools.tools.survey import LOOK_NS, PATIENCE_NS, Survey, Surveyor, survey
 
 
 class World:
@@ -171,6 +175,33 @@ def test_a_stream_whose_configuration_changes_is_looked_at_anew(world: World) ->
     assert len(one.phasors) in (1, 3)
     assert one.inventory.config_changes > 0
     assert len(one.senders) == 2
+
+
+def test_what_a_device_sends_over_two_connections_is_one_stream() -> None:
+    """Its configuration over TCP, its data over UDP, perhaps from another address."""
+    config = stream(7)
+    surveyor = Surveyor([parse_endpoint("tcp+udp://192.0.2.1:4712?data=4713")], 0)
+    tcp, udp = Flow("tcp", "192.0.2.1:4712", "192.0.2.9:5000"), Flow("udp", "192.0.2.2:999", "192.0.2.9:4713")
+    surveyor.hear(LinkEvent(LinkKind.NO_CONFIG, "", (0,), "", 7, udp))
+    opening, *data = recording(config, 10)
+    surveyor.take(opening._replace(flow=tcp), lambda flow, idcode: (0,), 0)
+    for block in gather(message._replace(flow=udp) for message in data):
+        assert isinstance(block, Block)
+        surveyor.take(block, lambda flow, idcode: (0,), 0)
+    (one,) = surveyor.endpoints[0].streams
+    assert (one.host, list(one.senders), one.inventory.frames) == ("192.0.2.1", ["192.0.2.2:999"], 10)
+    assert not surveyor.settled(LOOK_NS - 1)
+    assert surveyor.settled(LOOK_NS)
+
+
+def test_a_connection_that_has_ended_has_told_whose_it_was() -> None:
+    surveyor = Surveyor([parse_endpoint("tcp://192.0.2.1:4712")], 0)
+    opening, *_ = recording(stream(7), 0)
+    surveyor.take(opening, lambda flow, idcode: (), 0)
+    assert surveyor.endpoints[0].streams == []
+    surveyor.hear(LinkEvent(LinkKind.CONFIGURED, "", (0,), "", 7, opening.flow))
+    surveyor.take(opening, lambda flow, idcode: (), 0)
+    assert len(surveyor.endpoints[0].streams) == 1
 
 
 def test_it_stops_when_told_to(world: World) -> None:
