@@ -18,10 +18,9 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import AsyncIterator, Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.clock import Clock
@@ -29,71 +28,20 @@ from pmutools.errors import SettingsError
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.sites import Site, StreamSites, load_sites, streams_of
-from pmutools.stream.handover import Handover
+from pmutools.stream.batches import StreamBatch
+from pmutools.stream.frames import StationValues, StreamFrame
+from pmutools.stream.handover import Items
 from pmutools.stream.readers import LiveReader, Reader, RecordedReader
-from pmutools.stream.values import StationValues, StreamBatch, StreamFrame
 from pmutools.timebase import NS
 from pmutools.tools.recordings import losses, open_recordings, saved_configs
 
-__all__ = ["Items", "StationValues", "Stream", "StreamBatch", "StreamFrame", "StreamSites", "Target", "open_stream"]
+__all__ = ["Items", "StationValues", "Stream", "StreamBatch", "StreamFrame", "Target", "open_stream"]
 
 Target = str | os.PathLike[str] | Endpoint | Site | StreamSites
 """A URL, a recording's path, an initialisation file's (``.ini``), or what these are parsed to."""
 T = TypeVar("T")
 WAITING_FRAMES = 20_000
 """So many frames wait for an event loop that does not take them; beyond, a live stream loses the oldest."""
-
-
-class Items(Generic[T]):
-    """Frames or batches, to be iterated with ``for`` or ``async for``; iterating again goes on where it was left."""
-
-    def __init__(
-        self,
-        portions: Generator[list[T], None, None],
-        *,
-        lossy: bool,
-        weigh: Callable[[T], int],
-        stop: Callable[[], None],
-    ) -> None:
-        self._portions, self._lossy, self._weigh, self._stop = portions, lossy, weigh, stop
-        self._items: Iterator[T] | None = None
-        self._handover: Handover[T] | None = None
-
-    def __iter__(self) -> Iterator[T]:
-        if self._handover is not None:
-            raise RuntimeError("this stream is read by an event loop")
-        if self._items is None:
-            self._items = chain.from_iterable(self._portions)
-        return self._items
-
-    def __aiter__(self) -> AsyncIterator[T]:
-        if self._items is not None:
-            raise RuntimeError("this stream is read without an event loop")
-        return self
-
-    async def __anext__(self) -> T:
-        if self._handover is None:
-            self._handover = Handover(self._portions, limit=WAITING_FRAMES, lossy=self._lossy, weigh=self._weigh)
-        return await self._handover.take()
-
-    @property
-    def overflow(self) -> int:
-        """Frames that were dropped because the event loop did not take them."""
-        return 0 if self._handover is None else self._handover.dropped
-
-    def close(self) -> None:
-        """End; what an event loop reads ends soon after."""
-        self._stop()
-        if self._handover is None:
-            self._portions.close()
-
-    async def aclose(self) -> None:
-        """End, and wait for it."""
-        self._stop()
-        if self._handover is None:
-            self._portions.close()
-        else:
-            await self._handover.close()
 
 
 class Stream:
@@ -135,25 +83,24 @@ class Stream:
             raise RuntimeError("this stream is read as frames, or as batches of another length, already")
         if self._batches is None:
             self._seconds = seconds
-            self._batches = Items(
-                self._closing(self._reader.batches(seconds)), lossy=self._reader.lossy, weigh=len, stop=self.stop
-            )
+            self._batches = self._items(self._reader.batches(seconds), len)
         return self._batches
 
     def _as_frames(self) -> Items[StreamFrame]:
         if self._batches is not None:
             raise RuntimeError("this stream is read as batches already")
         if self._frames is None:
-            self._frames = Items(
-                self._closing(self._reader.frames()), lossy=self._reader.lossy, weigh=lambda _: 1, stop=self.stop
-            )
+            self._frames = self._items(self._reader.frames(), lambda _: 1)
         return self._frames
 
-    def _closing(self, portions: Generator[list[T], None, None]) -> Generator[list[T], None, None]:
-        try:
-            yield from portions
-        finally:
-            self._reader.close()
+    def _items(self, portions: Generator[list[T], None, None], weigh: Callable[[T], int]) -> Items[T]:
+        def closing() -> Generator[list[T], None, None]:
+            try:
+                yield from portions
+            finally:
+                self._reader.close()
+
+        return Items(closing(), limit=WAITING_FRAMES, lossy=self._reader.lossy, weigh=weigh, stop=self.stop)
 
     # --- what is known
 
@@ -184,20 +131,23 @@ class Stream:
         self._reader.stop()
 
     def close(self) -> None:
-        """End, and close sockets and files; may be called again."""
-        for items in (self._frames, self._batches):
-            if items is not None:
-                items.close()
-                return
-        self._reader.close()
+        """End, and close sockets and files; may be called again.
+
+        Where an event loop reads, its thread closes them soon after.
+        """
+        items = self._frames or self._batches
+        if items is not None:
+            items.close()
+        if items is None or not items.threaded:
+            self._reader.close()
 
     async def aclose(self) -> None:
         """:meth:`close` for an event loop: waits until the sockets are closed."""
-        for items in (self._frames, self._batches):
-            if items is not None:
-                await items.aclose()
-                return
-        self._reader.close()
+        items = self._frames or self._batches
+        if items is not None:
+            await items.aclose()
+        if items is None or not items.threaded:
+            self._reader.close()
 
     def __enter__(self) -> Stream:
         return self

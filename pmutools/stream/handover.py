@@ -1,11 +1,12 @@
-"""From a thread that waits for sockets to an event loop that must not: a queue of bounded weight."""
+"""Items for ``for`` and ``async for``; from a thread that waits for sockets to an event loop that must not."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import AsyncIterator, Callable, Generator, Iterator
+from itertools import chain
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -109,3 +110,63 @@ class Handover(Generic[T]):
             self._loop.call_soon_threadsafe(event.set)
         except RuntimeError:  # the loop is closed: nobody takes anything any more
             self._closed = True
+
+
+class Items(Generic[T]):
+    """Frames or batches, to be iterated with ``for`` or ``async for``; iterating again goes on where it was left."""
+
+    def __init__(
+        self,
+        portions: Generator[list[T], None, None],
+        *,
+        limit: int,
+        lossy: bool,
+        weigh: Callable[[T], int],
+        stop: Callable[[], None],
+    ) -> None:
+        """``stop`` makes ``portions`` end soon; the others are those of :class:`Handover`."""
+        self._portions, self._stop = portions, stop
+        self._limit, self._lossy, self._weigh = limit, lossy, weigh
+        self._items: Iterator[T] | None = None
+        self._handover: Handover[T] | None = None
+
+    def __iter__(self) -> Iterator[T]:
+        if self._handover is not None:
+            raise RuntimeError("this stream is read by an event loop")
+        if self._items is None:
+            self._items = chain.from_iterable(self._portions)
+        return self._items
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        if self._items is not None:
+            raise RuntimeError("this stream is read without an event loop")
+        return self
+
+    async def __anext__(self) -> T:
+        if self._handover is None:
+            self._handover = Handover(self._portions, limit=self._limit, lossy=self._lossy, weigh=self._weigh)
+        return await self._handover.take()
+
+    @property
+    def threaded(self) -> bool:
+        """Whether a thread reads them, which closes what it reads from."""
+        return self._handover is not None
+
+    @property
+    def overflow(self) -> int:
+        """Frames that were dropped because the event loop did not take them."""
+        return 0 if self._handover is None else self._handover.dropped
+
+    def close(self) -> None:
+        """End; what an event loop reads ends soon after."""
+        self._stop()
+        if self._handover is None:
+            self._portions.close()
+
+    async def aclose(self) -> None:
+        """End, and wait for it."""
+        self._stop()
+        if self._handover is None:
+            self._portions.close()
+        else:
+            await self._handover.close()

@@ -19,7 +19,8 @@ from pmutools.formats.source import Block, Source
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint
 from pmutools.sites import Site
-from pmutools.stream.values import StreamBatch, StreamFrame
+from pmutools.stream.batches import StreamBatch
+from pmutools.stream.frames import StreamFrame
 from pmutools.timebase import NS
 from pmutools.tools.live import LiveSource
 from pmutools.tools.news import Reasons

@@ -214,6 +214,9 @@ def test_a_stream_that_was_never_read_is_closed_too() -> None:
         async with open_stream(f"udp://127.0.0.1:{port}"):
             assert not can_be_bound(port)
         assert can_be_bound(port)
+        async with open_stream(f"udp://127.0.0.1:{port}") as opened:
+            aiter(opened)
+        assert can_be_bound(port)
 
     running(main)
 

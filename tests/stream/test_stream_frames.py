@@ -220,6 +220,10 @@ def test_closing_tells_the_server_to_stop_and_frees_the_port() -> None:
         open_stream(f"udp://127.0.0.1:{port}")
     opened.close()
     opened.close()
+    with open_stream(f"udp://127.0.0.1:{port}") as opened:
+        iter(opened)
+    with open_stream(f"udp://127.0.0.1:{port}") as opened:
+        opened.batches()
     open_stream(f"udp://127.0.0.1:{port}").close()
 
 
