@@ -21,6 +21,7 @@ LAYERS = [
     ["pmutools.c37118"],
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],
     ["pmutools.grid", "pmutools.formats", "pmutools.measure", "pmutools.sites"],
+    ["pmutools.clocksources"],
     ["pmutools.tools"],
     ["pmutools.cli", "pmutools.stream"],
     # the controller

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from generate.markdown import attribute_docs, code, prose, table
+from pmutools.cli.clock_text import ADVICE
+from pmutools.measure.clocks import BOUNDS
 from pmutools.measure.diagnoses import ROWS
 from pmutools.measure.fits import FAMILIES
 from pmutools.measure.quality import Events
@@ -55,12 +57,12 @@ def families() -> str:
 
 def clocks() -> str:
     """Who is asked, and what bound follows."""
-    rows = [
-        ("PTP", "abs(master offset) + abs(system clock's offset from the PHC) + mean path delay / 2"),
-        ("chrony", "abs(system time correction) + root dispersion + root delay / 2"),
-        ("kernel", prose("``maxerror``, unless ``STA_UNSYNC`` is set")),
-    ]
-    return table(("asked in this order", "bound"), rows)
+    return table(("asked in this order", "bound"), ((code(name), prose(bound)) for name, bound in BOUNDS.items()))
+
+
+def advice() -> str:
+    """What to do about a clock."""
+    return table(("it is said that", "to do"), ((row.sign, row.text or "nothing") for row in ADVICE))
 
 
 GENERATORS: dict[str, Callable[[], str]] = {
@@ -70,4 +72,5 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "measure-events": events,
     "fit-families": families,
     "clock-bounds": clocks,
+    "clock-advice": advice,
 }

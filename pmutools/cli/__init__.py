@@ -17,6 +17,7 @@ COMMANDS = {
     "play": ("pmutools.cli.play", "Stream a recording live, as any number of PMUs."),
     "ctl": ("pmutools.cli.ctl", "Control a running player."),
     "read": ("pmutools.cli.read", "Read live streams and log them."),
+    "clock": ("pmutools.cli.clock", "How good this machine's clock is, by all who can tell."),
 }
 
 

@@ -1,108 +1,21 @@
-"""How good the receiver's clock is: what the kernel, chrony, PTP and gpsd say of it, as one bound.
-
-Reading them is the caller's. A bound is what a source promises, not what it hopes for: chrony's is |system time
-correction| + root dispersion + root delay / 2, the kernel's is ``maxerror``.
-"""
+"""How good the receiver's clock is, by all who could be asked: one bound, and what else should be known."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from enum import IntFlag
 from typing import Any
 
-from pmutools.measure.histogram import NS_PER_MS, ms
+from pmutools.measure.clocks import ChronyClock, GpsClock, KernelClock, PtpClock, TimeStatus
+from pmutools.timebase import NS
+
+__all__ = ["ChronyClock", "ClockLog", "ClockQuality", "GpsClock", "KernelClock", "PtpClock", "TimeStatus"]
 
 TAI_LESS_UTC_S = 37
 """Since 2017; 36 or 38 are told apart from it by the table of diagnoses, should a leap second come."""
 UNDISCIPLINED_NS = 1_000_000_000
 """A bound beyond this is none."""
-
-
-class TimeStatus(IntFlag):
-    """Bits of the kernel's ``timex.status`` that matter here."""
-
-    PLL = 0x0001
-    INSERT_LEAP = 0x0010
-    DELETE_LEAP = 0x0020
-    UNSYNCHRONISED = 0x0040
-    PPS_SIGNAL = 0x0100
-    NANOSECONDS = 0x2000
-
-
-@dataclass(frozen=True, slots=True)
-class KernelClock:
-    """What ``adjtimex`` says."""
-
-    offset_ns: int
-    frequency_ppm: float
-    maxerror_us: int
-    esterror_us: int
-    status: int
-    tai_offset_s: int = 0
-    """0 where nobody told the kernel."""
-
-    @property
-    def synchronised(self) -> bool:
-        return not self.status & TimeStatus.UNSYNCHRONISED
-
-    @property
-    def bound_ns(self) -> int | None:
-        return self.maxerror_us * 1000 if self.synchronised else None
-
-
-@dataclass(frozen=True, slots=True)
-class ChronyClock:
-    """What ``chronyc tracking`` says; ``correction_s`` > 0: the clock is slow."""
-
-    reference: str
-    stratum: int
-    correction_s: float
-    rms_offset_s: float
-    frequency_ppm: float
-    skew_ppm: float
-    root_delay_s: float
-    root_dispersion_s: float
-    leap_status: str = "Normal"
-
-    @property
-    def bound_ns(self) -> int | None:
-        if self.leap_status == "Not synchronised":
-            return None
-        return round((abs(self.correction_s) + self.root_dispersion_s + self.root_delay_s / 2) * 1e9)
-
-
-@dataclass(frozen=True, slots=True)
-class PtpClock:
-    """What ``pmc`` says of the port, and ``phc2sys`` of the system's clock against it."""
-
-    grandmaster: str
-    clock_class: int
-    """6 locked, 7 in holdover."""
-    master_offset_ns: int
-    mean_path_delay_ns: int
-    utc_offset_s: int | None = None
-    system_offset_ns: int = 0
-
-    @property
-    def bound_ns(self) -> int | None:
-        if self.clock_class not in (6, 7, 13, 14):
-            return None
-        return abs(self.master_offset_ns) + abs(self.system_offset_ns) + self.mean_path_delay_ns // 2
-
-
-@dataclass(frozen=True, slots=True)
-class GpsClock:
-    """What gpsd says: TPV's mode (2 and 3 have a fix) and time uncertainty."""
-
-    mode: int
-    time_error_s: float | None = None
-    pps: bool = False
-
-    @property
-    def bound_ns(self) -> int | None:
-        if self.mode < 2:
-            return None
-        return None if self.time_error_s is None else round(self.time_error_s * 1e9)
+_MS = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +31,15 @@ class ClockQuality:
     def bound_ns(self) -> int | None:
         """How wrong the clock may be; None where nobody can tell.
 
-        Who disciplines the clock knows best: PTP, then chrony, then the kernel's own figure. gpsd alone says how good
-        the time is that it has to offer, not whether the clock follows it.
+        Who disciplines the clock knows best: PTP, then chrony; then who has compared it with a pulse; then the
+        kernel's own figure. A source that promises nothing leaves the word to the next.
         """
-        for source in (self.ptp, self.chrony, self.kernel):
-            if source is not None:
-                bound = source.bound_ns
-                return bound if bound is not None and bound < UNDISCIPLINED_NS else None
-        return None
+        return self._promised()[1]
 
     @property
     def source(self) -> str:
-        """Whose word :attr:`bound_ns` is."""
-        named = (("ptp", self.ptp), ("chrony", self.chrony), ("kernel", self.kernel))
-        return next((name for name, source in named if source is not None), "none")
+        """Whose word :attr:`bound_ns` is; where nobody promises anything, who was asked first."""
+        return self._promised()[0]
 
     @property
     def disciplined(self) -> bool:
@@ -140,23 +48,97 @@ class ClockQuality:
     @property
     def text(self) -> str:
         if (bound_ns := self.bound_ns) is None:
-            who = "nobody says" if self.source == "none" else f"{self.source} says it is not"
             return (
-                f"receiver clock not disciplined ({who}); delays hold its unknown offset, differences of delays do not"
+                f"receiver clock not disciplined ({self._why_not()}); "
+                "delays hold its unknown offset, differences of delays do not"
             )
-        return f"receiver clock within {bound_ns / NS_PER_MS:.3g} ms of UTC, by {self.source}"
+        return f"receiver clock within {bound_ns / _MS:.3g} ms of UTC, by {self.source}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else should be known: leap seconds, sources that contradict each other."""
+        return tuple(text for note in NOTES if (text := note(self)) is not None)
 
     def to_json(self) -> dict[str, Any]:
+        from pmutools.measure.histogram import ms  # numpy comes with it, which who only asks for the time can spare
+
         parts = {name: None if part is None else asdict(part) for name, part in self._parts().items()}
         return {
             "disciplined": self.disciplined,
             "source": self.source,
             "bound_ms": ms(self.bound_ns),
             "text": self.text,
+            "notes": list(self.notes),
         } | parts
 
     def _parts(self) -> dict[str, Any]:
         return {"kernel": self.kernel, "chrony": self.chrony, "ptp": self.ptp, "gps": self.gps}
+
+    def _promised(self) -> tuple[str, int | None]:
+        asked = (("ptp", self.ptp), ("chrony", self.chrony), ("gps", self.gps), ("kernel", self.kernel))
+        for name, part in asked:
+            bound = None if part is None else part.bound_ns
+            if bound is not None and bound < UNDISCIPLINED_NS:
+                return name, bound
+        return next((name for name, part in asked if part is not None and name != "gps"), "none"), None
+
+    def _why_not(self) -> str:
+        if self.ptp is not None:
+            return self.ptp.why_not or "ptp says it is not"
+        if self.chrony is not None:
+            return "chrony follows its own clock only" if self.chrony.local else "chrony says it is not"
+        if self.kernel is None:
+            return "nobody says"
+        if self.kernel.synchronised and not self.kernel.told:
+            return "it is set by a program that does not say how well"
+        return "kernel says it is not"
+
+
+def _leap(quality: ClockQuality) -> str | None:
+    kernel, chrony, ptp = quality.kernel, quality.chrony, quality.ptp
+    status = kernel.status if kernel is not None else 0
+    told = chrony.leap_status if chrony is not None else ""
+    if status & TimeStatus.INSERT_LEAP or told == "Insert second" or (ptp is not None and ptp.leap > 0):
+        return "a leap second will be inserted at the end of the day: stamps around 23:59:60 are a second ambiguous"
+    if status & TimeStatus.DELETE_LEAP or told == "Delete second" or (ptp is not None and ptp.leap < 0):
+        return "a second will be left out at the end of the day"
+    return None
+
+
+def _smear(quality: ClockQuality) -> str | None:
+    if quality.chrony is None or not quality.chrony.smeared:
+        return None
+    return (
+        f"{quality.chrony.name} smears leap seconds: within 12 h of one, time by it is up to 0.5 s from UTC; "
+        "GPS-fed PMUs are not"
+    )
+
+
+def _tai(quality: ClockQuality) -> str | None:
+    kernel, ptp = quality.kernel, quality.ptp
+    if kernel is None or ptp is None or ptp.utc_offset_s is None or kernel.tai_offset_s in (0, ptp.utc_offset_s):
+        return None
+    return f"TAI - UTC is {kernel.tai_offset_s} s to the kernel and {ptp.utc_offset_s} s to PTP: one of them is wrong"
+
+
+def _pulse(quality: ClockQuality) -> str | None:
+    gps, bound_ns = quality.gps, quality.bound_ns
+    if gps is None or gps.clock_offset_ns is None or bound_ns is None or quality.source == "gps" or not gps.fix:
+        return None
+    if abs(gps.clock_offset_ns) <= bound_ns + gps.precision_ns:
+        return None
+    return f"the GPS pulse sees the clock {gps.clock_offset_ns / _MS:+.3g} ms off, more than {quality.source} admits"
+
+
+def _serial(quality: ClockQuality) -> str | None:
+    gps = quality.gps
+    if gps is None or gps.serial_offset_ns is None or not gps.fix or abs(gps.serial_offset_ns) < UNDISCIPLINED_NS:
+        return None
+    return f"the GPS receiver's time and the system clock are {gps.serial_offset_ns / NS:+.1f} s apart"
+
+
+NOTES: tuple[Callable[[ClockQuality], str | None], ...] = (_leap, _smear, _tai, _pulse, _serial)
+"""Each gives a text where it applies."""
 
 
 @dataclass
@@ -191,6 +173,8 @@ class ClockLog:
         return None if self.undisciplined or not self.samples else self.worst_ns
 
     def to_json(self) -> dict[str, Any]:
+        from pmutools.measure.histogram import ms
+
         return self.last.to_json() | {
             "samples": self.samples,
             "undisciplined_samples": self.undisciplined,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.measured import MS, arranged, batch, measured, stamps
@@ -25,10 +27,25 @@ def test_bounds_of_clocks() -> None:
     assert CHRONY.bound_ns == 2_600_000
     assert UNSYNCHRONISED.bound_ns is None
     assert KernelClock(0, 0.0, 900, 100, 0x2001).bound_ns == 900_000
-    assert PtpClock("x", 6, -150, 1000, 37, 50).bound_ns == 700
-    assert PtpClock("x", 248, 0, 0).bound_ns is None
-    assert GpsClock(3, 5e-7).bound_ns == 500
-    assert GpsClock(1).bound_ns is GpsClock(3).bound_ns is None
+    assert PtpClock("x", 6, -150, 1000, 37, 50).bound_ns == 1200
+    assert PtpClock("x", 6, -150, 1000, 37, 50, accuracy_ns=100).bound_ns == 1300
+    assert PtpClock("x", 248, 0, 0, 37, 0).bound_ns is None
+    assert PtpClock("x", 6, 0, 0).bound_ns is None, "how far the system's clock is from the card's is not known"
+    assert GpsClock(3, 5e-7).bound_ns is None, "nobody has compared the clock with it"
+    assert GpsClock(3, 5e-7, True, -3000).bound_ns == 4000
+    assert GpsClock(1, None, True, -3000).bound_ns is None
+
+
+@pytest.mark.parametrize(
+    ("maxerror_us", "esterror_us", "told"),
+    [(5_500, 0, False), (0, 0, False), (2_500, 16_000_000, False), (5_501, 0, True), (5_500, 80, True)],
+    ids=["timesyncd after 11 s", "just set by it", "linuxptp after 5 s", "chrony", "ntpd"],
+)
+def test_an_error_that_nobody_told_the_kernel_is_no_bound(maxerror_us: int, esterror_us: int, told: bool) -> None:
+    clock = KernelClock(0, 0.0, maxerror_us, esterror_us, 0x2001)
+    assert clock.told is told
+    assert clock.bound_ns == (maxerror_us * 1000 if told else None)
+    assert told or "does not say how well" in ClockQuality(clock).text
 
 
 def test_who_disciplines_is_asked_first() -> None:
@@ -39,7 +56,48 @@ def test_who_disciplines_is_asked_first() -> None:
     assert "not disciplined (kernel says" in ClockQuality(UNSYNCHRONISED).text
     assert "nobody says" in ClockQuality().text
     assert ClockQuality(gps=GpsClock(3, 1e-6)).bound_ns is None, "gpsd does not say that the clock follows it"
-    assert ClockQuality(ptp=PtpClock("x", 6, 0, 2 * 10**9)).bound_ns is None
+    assert ClockQuality(ptp=PtpClock("x", 6, 0, 2 * 10**9, 37, 0)).bound_ns is None
+
+
+def test_who_promises_nothing_leaves_the_word_to_the_next() -> None:
+    lost = PtpClock("x", 6, 0, 0, 37, 0, state="LISTENING")
+    local = replace(CHRONY, reference="7F7F0101")
+    pulse = GpsClock(3, 1e-6, True, 2000)
+    good = KernelClock(0, 0.0, 900, 100, 0x2001)
+    assert ClockQuality(good, CHRONY, lost, pulse).source == "chrony"
+    assert ClockQuality(good, local, lost, pulse).source == "gps"
+    assert ClockQuality(good, local, lost).source == "kernel"
+    assert ClockQuality(UNSYNCHRONISED, local, lost).source == "ptp"
+    assert "LISTENING" in ClockQuality(UNSYNCHRONISED, local, lost).text
+    assert "its own clock only" in ClockQuality(UNSYNCHRONISED, local).text
+
+
+@pytest.mark.parametrize(
+    ("quality", "note"),
+    [
+        (ClockQuality(KernelClock(0, 0.0, 1, 1, 0x11)), "leap second will be inserted"),
+        (ClockQuality(KernelClock(0, 0.0, 1, 1, 0x21)), "left out"),
+        (ClockQuality(chrony=replace(CHRONY, leap_status="Insert second")), "leap second will be inserted"),
+        (ClockQuality(chrony=replace(CHRONY, leap_status="Delete second")), "left out"),
+        (ClockQuality(ptp=PtpClock("x", 6, 0, 0, leap=1)), "leap second will be inserted"),
+        (ClockQuality(ptp=PtpClock("x", 6, 0, 0, leap=-1)), "left out"),
+        (ClockQuality(chrony=replace(CHRONY, name="216.239.35.0")), "smears leap seconds"),
+        (ClockQuality(KernelClock(0, 0.0, 1, 1, 1, 36), ptp=PtpClock("x", 6, 0, 0, 37)), "one of them is wrong"),
+        (ClockQuality(chrony=CHRONY, gps=GpsClock(3, None, True, 5 * MS)), "+5 ms off, more than chrony admits"),
+        (ClockQuality(gps=GpsClock(3, serial_offset_ns=-3600 * 10**9)), "-3600.0 s apart"),
+    ],
+)
+def test_what_else_should_be_known(quality: ClockQuality, note: str) -> None:
+    (told,) = quality.notes
+    assert note in told
+    assert quality.to_json()["notes"] == [told]
+
+
+def test_nothing_else_is_nothing() -> None:
+    good = KernelClock(0, 0.0, 900, 100, 0x2001, 37)
+    gps = GpsClock(3, 1e-6, True, 2000, serial_offset_ns=300 * MS)
+    assert ClockQuality(good, CHRONY, PtpClock("x", 6, 0, 2000, 37, 0), gps).notes == ()
+    assert ClockQuality().notes == ()
 
 
 def test_the_worst_of_a_run_counts() -> None:
