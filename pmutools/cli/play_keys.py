@@ -1,16 +1,16 @@
-"""The keys of the interactive player: bytes to keys, and keys to things to do; no terminal, no clock.
+"""The keys of the interactive player, and what they do; no terminal, no clock.
 
 :data:`KEYS` is the table from which the help line, the help page and the documentation are made.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from glob import escape
 from typing import NamedTuple
 
+from pmutools.cli.keys import edited
 from pmutools.impair.profile import Action
 from pmutools.impair.verbs import SPEEDS
 from pmutools.parsers import Place
@@ -20,7 +20,6 @@ from pmutools.tools.player.status import PlayerStatus, PlayState, StreamStatus
 
 EVENTS = 40
 """Events kept for the screen."""
-PROMPT_CHARACTERS = 1000
 FASTER = 1.1
 
 
@@ -182,23 +181,14 @@ def press(ui: Ui, name: str, status: PlayerStatus) -> Step:
 
 
 def _typed(ui: Ui, prompt: Prompt, name: str, status: PlayerStatus) -> Step:
-    text = prompt.text
     match name:
-        case "ESC":
-            return Step(replace(ui, prompt=None).said(""))
         case "ENTER":
             return _entered(ui, prompt, status)
-        case "BACKSPACE":
-            if not text:
-                return Step(replace(ui, prompt=None).said(""))
-            text = text[:-1]
-        case "ERASE":
-            text = ""
-        case "SPACE":
-            text += " "
-        case _ if len(name) == 1:
-            text += name
-    return Step(replace(ui, prompt=prompt._replace(text=text[:PROMPT_CHARACTERS])).said(""))
+        case "BACKSPACE" if not prompt.text:
+            return Step(replace(ui, prompt=None).said(""))
+        case "ESC":
+            return Step(replace(ui, prompt=None).said(""))
+    return Step(replace(ui, prompt=prompt._replace(text=edited(prompt.text, name))).said(""))
 
 
 def _entered(ui: Ui, prompt: Prompt, status: PlayerStatus) -> Step:
@@ -245,63 +235,3 @@ def pattern(stream: StreamStatus) -> str:
 def seconds(value: float) -> str:
     """Seconds to the microsecond, without zeros at the end."""
     return f"{value:.6f}".rstrip("0").rstrip(".")
-
-
-# --- bytes to keys -----------------------------------------------------------------------------------------------
-
-_SEQUENCES = {
-    **{
-        f"\x1b{lead}{end}".encode(): name
-        for lead in "[O"
-        for end, name in zip("ABCDHF", ("UP", "DOWN", "RIGHT", "LEFT", "HOME", "END"), strict=True)
-    },
-    b"\x1b[5~": "PGUP",
-    b"\x1b[6~": "PGDN",
-    b"\x1b[Z": "BACKTAB",
-}
-_SEQUENCE = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*[@-~]|O[ -~])")
-_BEGUN = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?")
-_LONGEST = 32
-"""Bytes of a sequence begun, after which it is taken for none."""
-_CONTROLS = {
-    0x08: "BACKSPACE",
-    0x7F: "BACKSPACE",
-    0x09: "TAB",
-    0x0A: "ENTER",
-    0x0D: "ENTER",
-    0x15: "ERASE",
-    0x20: "SPACE",
-}
-
-
-def decode(data: bytes, *, final: bool = False) -> tuple[list[str], bytes]:
-    """Keys in ``data``, and what may be the beginning of one; ``final``: nothing more comes with it."""
-    keys: list[str] = []
-    at = 0
-    while at < len(data):
-        first = data[at]
-        if first == 0x1B:
-            if match := _SEQUENCE.match(data, at):
-                if name := _SEQUENCES.get(match[0]):
-                    keys.append(name)
-                at = match.end()
-                continue
-            begun = _BEGUN.match(data, at)
-            if begun is not None and begun.end() == len(data) and not final and begun.end() - at < _LONGEST:
-                break
-            keys.append("ESC")
-            at += 1
-        elif first in _CONTROLS:
-            keys.append(_CONTROLS[first])
-            at += 1
-        elif first < 0x80:
-            keys += [chr(first)] if first >= 0x20 else []
-            at += 1
-        else:
-            length = 2 if 0xC2 <= first < 0xE0 else 3 if 0xE0 <= first < 0xF0 else 4 if 0xF0 <= first < 0xF5 else 1
-            if at + length > len(data) and not final:
-                break
-            text = data[at : at + length].decode("utf-8", "ignore")
-            keys += [text] if text.isprintable() and text else []
-            at += length if text else 1
-    return keys, data[at:]

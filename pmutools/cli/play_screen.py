@@ -8,32 +8,35 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from rich.cells import cell_len
-from rich.style import Style
 from rich.text import Text
 
+from pmutools.cli.columns import fit, layout, number
+from pmutools.cli.look import (
+    BAD,
+    BOLD,
+    DIM,
+    GOOD,
+    HEADER,
+    MARK,
+    PLAIN,
+    SELECTED,
+    fitted,
+    help_line,
+    help_page,
+    prompt_line,
+)
 from pmutools.cli.play_keys import KEYS, PROMPTS, Ui, chosen, seconds
 from pmutools.cli.shell import visible
-from pmutools.cli.status_text import faults_text, fit, layout, misses_text, number, speed_text
+from pmutools.cli.status_text import COLUMNS, faults_text, misses_text, speed_text
 from pmutools.tools.player.status import PlayerStatus, PlayState
 
-SMALLEST = (40, 10)
 HEAD = 5
 """Lines above the streams, with the header of their table."""
 FOOT = 3
 """Lines below them and the events: selected stream, message, help."""
 MORE_EVENTS = 8
 
-PLAIN = Style()
-BOLD = Style(bold=True)
-DIM = Style(dim=True)
-HEADER = Style(underline=True)
-SELECTED = Style(reverse=True)
-GOOD = Style(color="green", bold=True)
-BAD = Style(color="red", bold=True)
-MARK = Style(color="magenta", bold=True)
 STATES = {PlayState.PLAYING: GOOD, PlayState.PAUSED: MARK, PlayState.WAITING: BOLD, PlayState.ENDED: BAD}
-"""Colours that can be read on dark and on light; all is said in words too, as there may be none."""
 
 
 class Title(NamedTuple):
@@ -58,17 +61,11 @@ def lines(
 
     ``reached`` is the speed that was measured.
     """
-    if width < SMALLEST[0] or height < SMALLEST[1]:
-        drawn = iter([Text("too small: {}x{} needed".format(*SMALLEST))])
-    elif ui.help:
-        drawn = iter(_help(title, width, height))
+    if ui.help:
+        drawn = help_page(f"pmu play {title}", ((key.shown, key.meaning) for key in KEYS), width, height)
     else:
         drawn = _lines(status, ui, title, width, height, reached)
-    for _ in range(height):
-        line = next(drawn, None) or Text()
-        if cell_len(line.plain) > width:
-            line.truncate(width)
-        yield line
+    return fitted(drawn, width, height)
 
 
 def _lines(
@@ -83,7 +80,7 @@ def _lines(
     selected = min(ui.selected, count - 1)
     top = max(selected, 0) // rows * rows
     page = status.streams[top : top + rows]
-    table = layout(width)
+    table = layout(COLUMNS, width)
     yield Text(table.header(), HEADER)
     for index, stream in enumerate(page, top):
         style = SELECTED if index == selected else DIM if not stream.enabled else PLAIN
@@ -94,7 +91,7 @@ def _lines(
     yield from (Text() for _ in range(space - len(events)))
     yield from (Text(visible(event), DIM) for event in events)
     yield _message(ui, status, width)
-    yield _help_line(width)
+    yield help_line([key.label for key in KEYS], width)
 
 
 def _state(status: PlayerStatus, reached: float | None) -> Text:
@@ -146,37 +143,8 @@ def _chosen(status: PlayerStatus, ui: Ui, page: str) -> Text:
 
 def _message(ui: Ui, status: PlayerStatus, width: int) -> Text:
     """The prompt, or what was said last; both if what was typed was wrong."""
-    said = Text(visible(ui.message), BAD if ui.error else PLAIN)
-    if ui.prompt is None:
-        return said
-    stream = chosen(ui, status)
-    asked = PROMPTS[ui.prompt.kind].format(visible(stream.name) if stream else "")
-    text = visible(ui.prompt.text)
-    room = max(8, (width if not ui.error else width // 2) - cell_len(asked) - 2)
-    tail = text if cell_len(text) <= room else f"…{text[1 - room :]}"
-    return Text.assemble((asked, BOLD), tail, (" ", SELECTED), "   " if ui.error else "", said)
-
-
-def help_words(width: int) -> list[str]:
-    """As many keys as fit; help and quit always."""
-    words = [key.label for key in KEYS if key.label]
-    while len(words) > 2 and len(" ".join(words)) > width:
-        del words[-3]
-    return words
-
-
-def _help_line(width: int) -> Text:
-    words = help_words(width)
-    gap = "  " if len("  ".join(words)) <= width else " "
-    line = Text()
-    for word in words:
-        key, _, label = word.partition(" ")
-        line.append(key, BOLD).append(f" {label}{gap}", DIM)
-    line.rstrip()
-    return line
-
-
-def _help(title: Title, width: int, height: int) -> list[Text]:
-    keys = [Text.assemble((f"{key.shown:>8}  ", BOLD), key.meaning.replace("`", "")) for key in KEYS]
-    head = Text(fit(visible(f"pmu play {title}"), width), BOLD)
-    return [head, *keys[: height - 2], Text("any key goes back", DIM)]
+    asked = None
+    if ui.prompt is not None:
+        stream = chosen(ui, status)
+        asked = PROMPTS[ui.prompt.kind].format(visible(stream.name) if stream else "")
+    return prompt_line(asked, ui.prompt.text if ui.prompt else "", ui.message, width, error=ui.error)

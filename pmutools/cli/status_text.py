@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
-from rich.cells import cell_len, set_cell_size
-
+from pmutools.cli.columns import Column, layout, number
 from pmutools.cli.shell import visible
 from pmutools.tools.player.status import PacingStatus, PlayerStatus, StreamStatus
-
-
-def number(value: float, width: int = 9) -> str:
-    """``value`` in at most ``width`` (>= 4) characters: whole, or in thousands (k), millions (M), ..."""
-    if not math.isfinite(value):
-        return "-"
-    for unit in ("", "k", "M", "G", "T"):
-        for digits in (1, 0) if unit else (0,):
-            text = f"{value:.{digits}f}{unit}"
-            if len(text) <= width:
-                return text
-        value /= 1000
-    return "-" * width
 
 
 def faults_text(faults: dict[str, str]) -> str:
@@ -57,20 +41,6 @@ def speed_text(speed: float) -> str:
 # --- columns -----------------------------------------------------------------------------------------------------
 
 
-class Column(NamedTuple):
-    """A column of the table of streams, shown where that is at least ``from_width`` wide; ``width`` 0: flexible."""
-
-    title: str
-    width: int
-    text: Callable[[StreamStatus], str]
-    from_width: int = 0
-
-    @property
-    def right(self) -> bool:
-        """Whether it holds numbers."""
-        return self.width > 0 and self.title != "on"
-
-
 def _count(fate: str, width: int) -> Callable[[StreamStatus], str]:
     return lambda stream: number(stream.fates.get(fate, 0), width)
 
@@ -78,7 +48,7 @@ def _count(fate: str, width: int) -> Callable[[StreamStatus], str]:
 COLUMNS = (
     Column("stream", 0, lambda stream: visible(stream.name)),
     Column("id", 5, lambda stream: str(stream.idcode)),
-    Column("on", 3, lambda stream: "on" if stream.enabled else "OFF"),
+    Column("on", 3, lambda stream: "on" if stream.enabled else "OFF", left=True),
     Column("to", 4, lambda stream: number(stream.clients, 4)),
     Column("sent", 8, _count("sent", 8)),
     Column("lost", 6, _count("lost", 6)),
@@ -93,42 +63,6 @@ COLUMNS = (
     Column("faults", 0, lambda stream: visible(faults_text(stream.faults))),
 )
 """What is told of each stream. ``to`` counts who gets it; the counts are frames; delays are in µs."""
-_NAME = (8, 12, 20)
-"""Narrowest name, widest where faults have as much room, widest where they have twice as much."""
-
-
-class Layout(NamedTuple):
-    """Columns that fit, and how wide each is."""
-
-    columns: tuple[Column, ...]
-    widths: tuple[int, ...]
-
-    def header(self) -> str:
-        return self._line(column.title for column in self.columns)
-
-    def row(self, stream: StreamStatus) -> str:
-        return self._line(column.text(stream) for column in self.columns)
-
-    def _line(self, texts: Iterable[str]) -> str:
-        cells = zip(texts, self.columns, self.widths, strict=True)
-        return " ".join(text.rjust(width) if column.right else fit(text, width) for text, column, width in cells)
-
-
-def layout(width: int) -> Layout:
-    """The table of streams in ``width`` character cells."""
-    columns = tuple(column for column in COLUMNS if width >= column.from_width)
-    left = width - sum(column.width for column in columns) - len(columns) + 1
-    name = max(_NAME[0], min(_NAME[1], left // 2), min(_NAME[2], left // 3))
-    rest = max(left - name, 6)
-    widths = tuple(column.width or (name if column.title == "stream" else rest) for column in columns)
-    return Layout(columns, widths)
-
-
-def fit(text: str, width: int) -> str:
-    """``text`` in exactly ``width`` cells; a cut is marked."""
-    if len(text) <= width and text.isascii():
-        return text.ljust(width)
-    return set_cell_size(text, width) if cell_len(text) <= width else f"{set_cell_size(text, width - 1)}…"
 
 
 # --- the table of pmu ctl stats ----------------------------------------------------------------------------------
@@ -149,7 +83,7 @@ def state_lines(status: PlayerStatus) -> list[str]:
 
 def status_lines(status: PlayerStatus, width: int) -> Sequence[str]:
     """All of it: the player, then a line a stream; at least 80 cells wide, faults whole."""
-    table = layout(max(width, 80))
+    table = layout(COLUMNS, max(width, 80))
     rows = []
     for stream in status.streams:
         counts = table.row(stream)[: -table.widths[-1]].rstrip()

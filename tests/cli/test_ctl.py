@@ -10,7 +10,8 @@ import pytest
 from support.commands import Pmu
 from support.controlled import FakePlayer, player_status, whole_json
 
-from pmutools.cli.status_text import fit, layout, number, progress_line, status_lines
+from pmutools.cli.columns import fit, layout, number
+from pmutools.cli.status_text import COLUMNS, progress_line, status_lines
 from pmutools.clock import SystemClock
 from pmutools.net.reactor import Reactor
 from pmutools.tools.player.control_address import parse_control_address
@@ -146,7 +147,7 @@ def test_numbers_fit(value: float, width: int, text: str) -> None:
 
 @pytest.mark.parametrize("width", [80, 96, 97, 120, 200, 300])
 def test_rows_are_as_wide_as_the_table(width: int) -> None:
-    table = layout(width)
+    table = layout(COLUMNS, width)
     for stream in player_status(4).streams:
         assert len(table.row(stream)) == len(table.header()) == width
 

@@ -177,7 +177,7 @@ def test_a_terminal_that_takes_nothing_holds_up_nothing() -> None:
             on.reactor.run(5 * MS)
             slowest = max(slowest, time.monotonic() - began)
         assert slowest < 0.5
-        assert len(on.display._terminal.queue) < 200_000
+        assert len(on.display.terminal.queue) < 200_000
 
 
 def test_a_terminal_that_is_gone_ends_the_player() -> None:

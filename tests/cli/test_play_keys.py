@@ -1,15 +1,14 @@
-"""The interactive player's keys: bytes to keys, keys to things to do; no terminal."""
+"""The interactive player's keys and what they do; no terminal."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.controlled import FakePlayer, player_status, stream_status
 
-from pmutools.cli.play_keys import KEYS, Prompt, Step, Ui, decode, foreseen, pattern, press
+from pmutools.cli.keys import decode
+from pmutools.cli.play_keys import KEYS, Prompt, Step, Ui, foreseen, pattern, press
 from pmutools.impair.profile import parse_action
 from pmutools.tools.player.control import parse_control
 from pmutools.tools.player.status import PlayState
@@ -155,43 +154,3 @@ def test_what_is_foreseen() -> None:
     assert foreseen(PLAYING, parse_action("speed 2")).speed == 2
     assert foreseen(PAUSED, parse_action("resume")) == PLAYING
     assert foreseen(PAUSED, parse_action("loop off")) == PAUSED
-
-
-# --- bytes
-
-
-@pytest.mark.parametrize(
-    ("data", "keys"),
-    [
-        (b"a+ \t\r\n\x7f\x08\x15", ["a", "+", "SPACE", "TAB", "ENTER", "ENTER", "BACKSPACE", "BACKSPACE", "ERASE"]),
-        (b"\x1b[A\x1bOB\x1b[C\x1b[D", ["UP", "DOWN", "RIGHT", "LEFT"]),
-        (b"\x1b[5~\x1b[6~\x1b[Z", ["PGUP", "PGDN", "BACKTAB"]),
-        (b"\x1b[1;5Cx\x1b[200~y\x1b[15~\x1bOP", ["x", "y"]),
-        ("é東𝄞".encode(), ["é", "東", "𝄞"]),
-        (b"\xff\xc3a\x80\x01\x00z", ["a", "z"]),
-        (b"\x1bx", ["ESC", "x"]),
-    ],
-)
-def test_bytes_are_keys_whole_and_in_pieces(data: bytes, keys: list[str]) -> None:
-    assert decode(data) == (keys, b"")
-    found, rest = list[str](), b""
-    for byte in data:
-        more, rest = decode(rest + bytes([byte]))
-        found += more
-    assert (found, rest) == (keys, b"")
-
-
-def test_escape_alone_is_a_key_once_nothing_follows() -> None:
-    assert decode(b"\x1b") == ([], b"\x1b")
-    assert decode(b"\x1b", final=True) == (["ESC"], b"")
-    assert decode(b"\x1b[1;") == ([], b"\x1b[1;")
-
-
-@given(st.binary(max_size=300))
-def test_any_bytes_are_keys(data: bytes) -> None:
-    keys, rest = decode(data)
-    assert len(rest) < 32
-    ui = Ui()
-    for key in keys:
-        ui = press(ui, key, PLAYING).ui
-    assert decode(rest, final=True)[1] == b""
