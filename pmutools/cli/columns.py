@@ -39,6 +39,8 @@ class Column(NamedTuple):
     from_width: int = 0
     left: bool = False
     """Words rather than numbers."""
+    tail: bool = False
+    """Of the last column: what is too long keeps its end."""
 
 
 class Layout(NamedTuple):
@@ -51,7 +53,10 @@ class Layout(NamedTuple):
         return self._line(column.title for column in self.columns)
 
     def row(self, row: Any) -> str:
-        return self._line(column.text(row) for column in self.columns)
+        texts = [column.text(row) for column in self.columns]
+        if self.columns[-1].tail:
+            texts[-1] = texts[-1][-self.widths[-1] :]
+        return self._line(texts)
 
     def _line(self, texts: Iterable[str]) -> str:
         cells = zip(texts, self.columns, self.widths, strict=True)

@@ -84,6 +84,11 @@ class Screen(ABC):
         """What has to be done about a stop by ^Z, before it and after."""
         return nullcontext()
 
+    def refresh(self) -> None:
+        """Draw, if something has changed and the terminal has taken the last picture."""
+        if self.terminal.entered:
+            self._draw()
+
     # --- from its beginning to its end
 
     def __enter__(self) -> Self:

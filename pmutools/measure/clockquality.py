@@ -55,6 +55,13 @@ class ClockQuality:
         return f"receiver clock within {bound_ns / _MS:.3g} ms of UTC, by {self.source}"
 
     @property
+    def short(self) -> str:
+        """:attr:`text` in a few words."""
+        if (bound_ns := self.bound_ns) is None:
+            return f"clock not disciplined ({self._why_not()})"
+        return f"clock within {bound_ns / _MS:.3g} ms, by {self.source}"
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What else should be known: leap seconds, sources that contradict each other."""
         return tuple(text for note in NOTES if (text := note(self)) is not None)

@@ -16,47 +16,18 @@ from pathlib import Path
 
 import pytest
 from support.controlled import FakePlayer
+from support.terminals import ENVIRONMENT, Screen, fcntl, pty, resize, termios
 
+from pmutools.cli.play_display import Display
+from pmutools.cli.play_screen import Title
 from pmutools.clock import SystemClock
 from pmutools.errors import SettingsError
 from pmutools.net.reactor import Reactor
 
-termios = pytest.importorskip("termios")
-pty = pytest.importorskip("pty")
-fcntl = pytest.importorskip("fcntl")
-
-from pmutools.cli.play_display import Display  # noqa: E402
-from pmutools.cli.play_screen import Title  # noqa: E402
-
 pytestmark = pytest.mark.realtime
 TITLE = Title("x.pcap", ("udp://127.0.0.1:4713",))
-ENVIRONMENT = {"TERM": "xterm", "LANG": "C.UTF-8"}
 MS = 1_000_000
 ROOT = Path(__file__).parents[2]
-
-
-def resize(fd: int, columns: int, lines: int) -> None:
-    fcntl.ioctl(
-        fd, termios.TIOCSWINSZ, lines.to_bytes(2, sys.byteorder) + columns.to_bytes(2, sys.byteorder) + bytes(4)
-    )
-
-
-class Screen:
-    """As much of a terminal as the display needs: what is on each line."""
-
-    def __init__(self) -> None:
-        self.raw = b""
-        self.lines: dict[int, str] = {}
-
-    def hear(self, data: bytes) -> None:
-        self.raw += data
-        text = self.raw.decode("utf-8", "ignore").rpartition("\x1b[2J")[2]
-        self.lines = {}
-        for number, line in re.findall(r"\x1b\[(\d+);1H(.*?)\x1b\[K", text, re.DOTALL):
-            self.lines[int(number)] = re.sub(r"\x1b\[[\d;]*m", "", line)
-
-    def __contains__(self, text: str) -> bool:
-        return any(text in line for line in self.lines.values())
 
 
 class Stage:
@@ -223,6 +194,7 @@ CHILD = """
 import os, signal, sys
 sys.path[:0] = [{root!r}, {tests!r}]
 from support.controlled import FakePlayer
+from support.terminals import ENVIRONMENT, Screen, fcntl, pty, resize, termios
 from pmutools.cli.play_display import Display
 from pmutools.cli.play_screen import Title
 from pmutools.clock import SystemClock

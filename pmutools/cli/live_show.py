@@ -1,0 +1,87 @@
+"""``--live`` of a command: a watch, the clock and a screen, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from pmutools.c37118.demux import Loss, Message
+from pmutools.cli.herald import Herald
+from pmutools.cli.shell import Talk
+from pmutools.cli.watch_display import WatchScreen
+from pmutools.cli.watch_keys import Command
+from pmutools.clocksources.watch import ClockWatch
+from pmutools.flow import Flow
+from pmutools.formats.source import Block
+from pmutools.measure.stream import WAIT_NS
+from pmutools.net.dialogue import LinkEvent
+from pmutools.timebase import NS
+from pmutools.tools.live import LiveSource
+from pmutools.tools.watch import Watch
+
+
+class LiveShow:
+    """From ``with`` to its end: give it the news (:meth:`hear`) and the rounds (:meth:`each_round`) of ``source``.
+
+    ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own.
+    """
+
+    def __init__(
+        self,
+        source: LiveSource,
+        title: str,
+        *,
+        talk: Talk,
+        view: str = "frequency",
+        out: str | Path | None = None,
+        more: Callable[[], Sequence[str]] = tuple,
+        commands: Sequence[Command] = (),
+        wait_ns: int = WAIT_NS,
+    ) -> None:
+        self._source, self._more = source, more
+        self._out = None if out is None or str(out) == "-" else Path(out)
+        self.watch = Watch(name=self._name, wait_ns=wait_ns)
+        self.screen = WatchScreen(title=title, view=view, commands=commands, herald=Herald(talk))
+        self._facts: tuple[str, ...] = ()
+        self._facts_due_ns = 0
+        self._stack = ExitStack()
+
+    def __enter__(self) -> LiveShow:
+        self.clock = self._stack.enter_context(ClockWatch())
+        self._stack.enter_context(self.screen)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def hear(self, event: LinkEvent) -> None:
+        """News of the source."""
+        self.watch.hear(event, self._source.clock.monotonic_ns())
+
+    def each_round(self, items: Sequence[Block | Message | Loss], now_ns: int) -> None:
+        """What came; ``now_ns`` is monotonic."""
+        self.watch.add(items, now_ns)
+        if now_ns >= self._facts_due_ns:
+            self._facts_due_ns, self._facts = now_ns + NS, tuple(self._look())
+        self.screen.update(self.watch, now_ns, self._facts)
+
+    def _look(self) -> Iterator[str]:
+        yield self.clock.quality.short
+        if self._out is not None:
+            yield f"{self._out.name} {_size(self._out) / 1e6:.1f} MB"
+        yield from self._more()
+
+    def _name(self, flow: Flow, idcode: int) -> str | None:
+        site = self._source.site(flow, idcode)
+        return None if site is None else site.name
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of the files side by side in the folder that is named as it."""
+    try:
+        if path.is_file():
+            return path.stat().st_size
+        return sum(file.stat().st_size for file in path.with_suffix("").iterdir())
+    except OSError:
+        return 0
