@@ -50,7 +50,7 @@ PORTS = ("4712", "4713", "4790")
 """Examples use these; whoever runs the tests may use them too."""
 
 sys.path.insert(0, str(DOCS))
-from generate import GENERATORS, display  # noqa: E402
+from generate import GENERATORS, display, live  # noqa: E402
 from hooks import MARKER, filled  # noqa: E402
 
 BESIDE = "beside: "
@@ -123,6 +123,14 @@ def test_the_picture_of_the_player_is_what_its_code_draws() -> None:
         re.sub(r"<[^>]*>|\s", "", text) for text in (display.PICTURE.read_text(encoding="utf-8"), display.svg())
     )
     assert kept.partition("PLAYING")[2] == made.partition("PLAYING")[2], display.__doc__
+
+
+@pytest.mark.parametrize("view", ["frequency", "delay"])
+def test_the_pictures_of_the_live_displays_are_what_their_code_draws(view: str) -> None:
+    kept, made = (
+        re.sub(r"<[^>]*>|\s", "", text) for text in (live.picture(view).read_text(encoding="utf-8"), live.svg(view))
+    )
+    assert kept.partition("LIVE")[2] == made.partition("LIVE")[2], live.__doc__
 
 
 # --- examples ----------------------------------------------------------------------------------------------------

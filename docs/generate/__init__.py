@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import api, commands, controller, impairments, measures, player, streams, structure, studies
+from generate import commands, controller, impairments, live, measures, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
     **streams.GENERATORS,
     **impairments.GENERATORS,
     **player.GENERATORS,
+    **live.GENERATORS,
     **controller.GENERATORS,
     **measures.GENERATORS,
     **studies.GENERATORS,

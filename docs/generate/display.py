@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console, Group
 from rich.terminal_theme import MONOKAI
+from rich.text import Text
 
 from pmutools.cli.play_keys import Ui
 from pmutools.cli.play_screen import Title, lines
@@ -56,13 +58,18 @@ def ui() -> Ui:
     return Ui(selected=1, message='fault "N2" loss=gemodel(1%,20%)', events=events)
 
 
-def svg() -> str:
-    """The picture, with the reader's own fonts: a page that is read offline can fetch none."""
-    console = Console(file=io.StringIO(), record=True, width=SIZE[0], height=SIZE[1], force_terminal=True)
-    console.print(Group(*lines(state(), ui(), TITLE, *SIZE, 1.0)), end="")
+def exported(drawn: Iterable[Text], size: tuple[int, int], title: str, unique_id: str) -> str:
+    """A screen as SVG, with the reader's own fonts: a page that is read offline can fetch none."""
+    console = Console(file=io.StringIO(), record=True, width=size[0], height=size[1], force_terminal=True)
+    console.print(Group(*drawn), end="")
     own = re.sub(r"@font-face \{\{.*?\}\}\n", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL)
     own = own.replace("font-family: Fira Code, monospace", "font-family: monospace")
-    return console.export_svg(title="pmu play --interactive", theme=MONOKAI, code_format=own, unique_id="player")
+    return console.export_svg(title=title, theme=MONOKAI, code_format=own, unique_id=unique_id)
+
+
+def svg() -> str:
+    """The picture."""
+    return exported(lines(state(), ui(), TITLE, *SIZE, 1.0), SIZE, "pmu play --interactive", "player")
 
 
 if __name__ == "__main__":

@@ -172,6 +172,7 @@ VIEWS: dict[str, tuple[Shown, ...]] = {
         Shown(_DUPLICATED, "duplicated"),
         Shown(Column("late", 5, _whole("late", 5)), "late"),
         Shown(Column("cmpl%", 5, _of("recent_complete", percent)), "recent_complete", falling=False),
+        Shown(_GOOD.column._replace(from_width=100), "recent_good", falling=False),
         Shown(Column("p99all", 6, _of("all_p99_ms", milliseconds), from_width=130), "all_p99_ms"),
         Shown(Column("maxall", 6, _of("all_max_ms", milliseconds), from_width=130), "all_max_ms"),
         Shown(Column("last 15 s", 0, lambda row: sparkline(row.delays_ms, 60, DELAY_SPAN_MS), tail=True)),
