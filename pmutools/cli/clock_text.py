@@ -70,6 +70,7 @@ def _ptp(clock: PtpClock) -> str:
 
 def _gps(clock: GpsClock) -> str:
     fix = MODES.get(clock.mode, f"mode {clock.mode}")
+    fix += f" of {clock.satellites} satellites" if clock.fix and clock.satellites else ""
     time = f", its time good to {duration(clock.time_error_s * 1e9)}" if clock.time_error_s is not None else ""
     if clock.clock_offset_ns is not None:
         return f"{fix}{time}, pulse: system clock {duration(clock.clock_offset_ns, '+')} off"

@@ -42,7 +42,7 @@ def command(
     """
     from pmutools.errors import SourceError
     from pmutools.net.dialogue import LinkEvent, LinkKind
-    from pmutools.tools.watch.tap import TappedSource
+    from pmutools.tools.tap import TappedSource
 
     talk = Talk(quiet, verbose)
     show: LiveShow | None = None

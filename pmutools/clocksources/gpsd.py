@@ -50,6 +50,7 @@ class GpsReports:
         """Mode and time uncertainty of each receiver."""
         self._offsets: dict[str, int] = {}
         self._precision_ns = PULSE_NS
+        self._satellites: int | None = None
 
     @property
     def complete(self) -> bool:
@@ -81,6 +82,7 @@ class GpsReports:
             clock_offset_ns=pps,
             precision_ns=self._precision_ns,
             serial_offset_ns=self._offsets.get("TOFF"),
+            satellites=self._satellites,
         )
 
     def _take(self, line: bytes) -> None:
@@ -99,7 +101,9 @@ class GpsReports:
                     self._precision_ns = max(1, round(NS * 2.0 ** int(report.get("precision", -20))))
                 case "TOFF":
                     self._offsets[kind] = _offset_ns(report)
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+                case "SKY" if "satellites" in report or "uSat" in report:
+                    self._satellites = _used(report)
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
             self.unreadable += 1
 
     def _position(self, report: dict[str, Any]) -> None:
@@ -117,6 +121,13 @@ def _offset_ns(report: dict[str, Any]) -> int:
         return int(report[f"{who}_sec"]) * NS + int(report[f"{who}_musec"] * 1000 if fraction is None else fraction)
 
     return time_ns("clock") - time_ns("real")
+
+
+def _used(report: dict[str, Any]) -> int:
+    """Satellites that the fix is made of. Versions before 3.22 have no sum."""
+    if "uSat" in report:
+        return int(report["uSat"])
+    return sum(bool(satellite.get("used")) for satellite in report["satellites"])
 
 
 def ask_gpsd(gpsd: Gpsd, patience: Patience) -> GpsClock:

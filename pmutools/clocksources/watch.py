@@ -90,7 +90,9 @@ class ClockWatch:
     """Asks all sources at once and then every ``period_s``, in a thread; nobody waits for it.
 
     :attr:`quality` is the last word at any time, from the kernel's on. ``with`` or :meth:`close` ends the thread,
-    within :data:`LEAVE_S`. Memory is constant. Starting a program holds Python up for about a millisecond.
+    within :data:`LEAVE_S`. Memory is constant. A round takes some 2 ms of processor time, of which other
+    threads may have to wait for a part. Who runs under SCHED_FIFO makes it before asking for that: threads made later
+    inherit it, and so does what they start.
     """
 
     def __init__(self, places: Places = HERE, *, period_s: float = PERIOD_S, clock: Clock | None = None) -> None:

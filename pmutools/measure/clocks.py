@@ -186,6 +186,8 @@ class GpsClock:
     """What one stamp of the pulse is good for."""
     serial_offset_ns: int | None = None
     """System clock less time of the receiver's message (TOFF): holds the message's own lateness, 0.1 to 0.6 s."""
+    satellites: int | None = None
+    """Those that the fix is made of."""
 
     @property
     def fix(self) -> bool:

@@ -65,7 +65,7 @@ def unwrapped(said: list[str]) -> str:
 
 
 def test_each_source_in_words() -> None:
-    gps = GpsClock(3, 1e-6, True, -700)
+    gps = GpsClock(3, 1e-6, True, -700, satellites=8)
     text = unwrapped(list(lines(ClockQuality(KERNEL, CHRONY, PTP, gps), {})))
     said = dict(line.split(maxsplit=1) for line in text.splitlines()[1:5])
     assert said["kernel"] == "synchronised, error up to 5.12 ms, frequency -1.500 ppm, TAI - UTC 37 s"
@@ -76,7 +76,7 @@ def test_each_source_in_words() -> None:
         "grandmaster 9e5a6b.fffe.6193ab, clock class 6: within 2.02 us (offset -247 ns, path delay 1.74 us, "
         "system clock +40 ns from the card's), TAI - UTC 37 s"
     )
-    assert said["gps"] == "3D fix, its time good to 1 us, pulse: system clock -700 ns off"
+    assert said["gps"] == "3D fix of 8 satellites, its time good to 1 us, pulse: system clock -700 ns off"
     silent = {"chrony": "chronyc is not installed\x1b[2J"}
     assert "not installed\\x1b[2J" in "\n".join(lines(ClockQuality(), silent))
 

@@ -306,13 +306,13 @@ def test_read_live_into_a_pipe(synthetic: Path, tmp_path: Path) -> None:
     url = f"udp://127.0.0.1:{port}"
     with (
         subprocess.Popen(
-            command("read", url, "--out", tmp_path / "x.csv", "--live", "--duration", 4),
+            command("read", url, "--out", tmp_path / "x.csv", "--live", "--duration", 3),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         ) as process,
-        started("play", synthetic, "--to", url, "--loop", 0, "--duration", 6, "--quiet"),
+        started("play", synthetic, "--to", url, "--loop", 0, "--duration", 5, "--quiet"),
     ):
         _, err = process.communicate(timeout=LIMIT_S * 2)
     assert process.returncode in (0, 3), err

@@ -59,6 +59,9 @@ def test_what_it_says() -> None:
     assert clock.bound_ns is None, "without a pulse nobody has compared the clock with the receiver's time"
     assert (reports.release, reports.devices, reports.unreadable, reports.complete) == ("3.22", 1, 0, False)
     assert heard(VERSION, TPV, TPV).complete, "a second has gone by without a pulse"
+    assert clock.satellites == 1
+    assert heard(VERSION, SKY.replace('"uSat":1,', ""), TPV).clock().satellites == 1
+    assert heard(VERSION, '{"class":"SKY","hdop":1.0}', TPV).clock().satellites is None
 
 
 def test_a_pulse_is_a_bound() -> None:
@@ -92,6 +95,8 @@ def test_of_several_receivers_the_one_with_a_fix() -> None:
         '{"class":"PPS","real_sec":null,"clock_sec":1}',
         '{"class":"PPS","real_sec":1,"real_nsec":0,"clock_sec":1,"clock_nsec":0,"precision":99999}',
         '{"class":"DEVICES","devices":3}',
+        '{"class":"SKY","satellites":[1,2]}',
+        '{"class":"SKY","uSat":"many"}',
         '{"class":["TPV"]}',
         "[" * 10_000,
         "<html>",
@@ -191,7 +196,9 @@ def test_a_real_gpsd(tmp_path: Path) -> None:
     """A receiver whose time is an hour old, as that of a recording is."""
     with gpsd_of(receiver(time.time() - 3600, 40), tmp_path) as port:
         place = Gpsd(port=port)
-        clock = until(lambda patience: ask_gpsd(place, patience), lambda clock: clock.mode == 3)
+        clock = until(
+            lambda patience: ask_gpsd(place, patience), lambda clock: clock.mode == 3 and clock.time_error_s is not None
+        )
         assert clock.time_error_s == pytest.approx(0.005)
         clock = until(lambda patience: ask_gpsd(place, patience), lambda clock: clock.serial_offset_ns is not None)
         assert clock.serial_offset_ns == pytest.approx(3600 * NS, abs=60 * NS)

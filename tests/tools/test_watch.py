@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -310,9 +311,7 @@ def test_names() -> None:
     pdc = type(of)(7, (two.stations[0], two.stations[0]), 60)
     made = batch(stamps(range(3)), of=of)
     wide = {name: np.repeat(getattr(made, name), 2, axis=1) for name in ("stat", "frequency", "rocof", "valid")}
-    joined = type(made)(
-        **{n: getattr(made, n) for n in made.__dataclass_fields__} | wide | {"config": pdc, "wire": None}
-    )
+    joined = replace(made, config=pdc, wire=None, **wide)
     watch.add([block(0, [0]), block(1, [0]), Block(stream(2)[0], joined)], NS)
     told = rows(watch.look(NS))
     assert list(told) == ["SITE", "N2", "PDC 7"]
@@ -346,6 +345,38 @@ def test_a_device_that_connects_for_ever_keeps_its_row() -> None:
     assert len(watch) == 1
     assert len(watch._known) <= 6
     assert watch.look(NS).row(0).frames == 50
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32), st.lists(st.integers(1, 40), min_size=1, max_size=12), st.sampled_from([1, 60, -7, 0, 240])
+)
+def test_any_stamps_and_arrivals(seed: int, sizes: list[int], rate: int) -> None:
+    """Whatever a device stamps: nothing is raised, and no count goes below nothing."""
+    random, watch, of = np.random.default_rng(seed), Watch(), config(rate)
+    for number, size in enumerate(sizes, 1):
+        spread = int(random.choice([1, 60, 5000, 2**31]))
+        time_ns = 1_700_000_000 * NS + random.integers(-spread, spread + 1, size) * (NS // 60)
+        made = batch(np.clip(time_ns, 0, (2**32 - 1) * NS), of=of)
+        arrival_ns = 1_700_000_000 * NS + random.integers(0, 10**12, size)
+        arrival_ns[random.random(size) < 0.1] = NO_TIME
+        watch.add([Block(stream(0)[0], replace(made, arrival_ns=arrival_ns))], number * ROUND_NS)
+        row = watch.look(number * ROUND_NS).row(0)
+        assert row.frames == sum(sizes[:number])
+        assert row.lost >= 0
+        assert row.duplicated >= 0
+        assert row.stale >= 0
+        assert row.frames >= row.duplicated + row.stale
+        assert not row.recent_loss < 0
+
+
+def test_a_concentrator_without_a_pmu() -> None:
+    of = replace(config(), stations=())
+    made = batch(stamps(range(20)))
+    none = {name: getattr(made, name)[:, :0] for name in ("stat", "frequency", "rocof", "valid", "phasors")}
+    empty = Block(stream(0)[0], replace(made, config=of, **none))
+    row = after([empty], [empty]).row(0)
+    assert (row.frames, row.stations, row.recent_good, row.duplicated) == (40, 0, 0, 20)
 
 
 @pytest.mark.realtime

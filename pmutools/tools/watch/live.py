@@ -125,13 +125,17 @@ class Round:
 
     def add(self, row: int, batch: Batch) -> None:
         """Take a block of the stream in a row."""
-        alone = batch.stat.shape[1] == 1
-        stat = batch.stat[:, 0] if alone else any_station(batch.stat)
-        valid = batch.valid[:, 0] if alone else np.logical_and.reduce(batch.valid, axis=1)
+        match batch.stat.shape[1]:
+            case 0:  # a concentrator without a PMU
+                stat, valid = np.zeros(len(batch), np.uint16), np.zeros(len(batch), np.bool_)
+                frequency_hz = np.full(len(batch), np.nan)
+            case 1:
+                stat, valid, frequency_hz = batch.stat[:, 0], batch.valid[:, 0], batch.frequency[:, 0]
+            case _:
+                stat, valid = any_station(batch.stat), np.logical_and.reduce(batch.valid, axis=1)
+                frequency_hz = batch.frequency[:, 0]
         self.rows.append(row)
-        self._parts.append(
-            Frames(batch.arrival_ns, batch.time_ns, batch.time_quality, stat, valid, batch.frequency[:, 0])
-        )
+        self._parts.append(Frames(batch.arrival_ns, batch.time_ns, batch.time_quality, stat, valid, frequency_hz))
 
     def gathered(self) -> tuple[Segments, Frames]:
         """A segment a stream, also where it came in several blocks."""
