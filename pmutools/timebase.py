@@ -93,6 +93,17 @@ def slots_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[n
     return slots
 
 
+def slot_times_array(slots: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
+    """:func:`slot_time_ns` over a column of shape (N,), at a rate as in slots_array."""
+    times: npt.NDArray[np.int64]
+    if rate.denominator == 1:
+        seconds, rest = divmod(slots, rate.numerator)
+        times = seconds * NS + (rest * NS + rate.numerator // 2) // rate.numerator
+    else:
+        times = slots * (rate.denominator * NS)
+    return times
+
+
 def grid_offset_array(time_ns: npt.NDArray[np.int64], rate: Fraction) -> npt.NDArray[np.int64]:
     """Signed distance in ns of each stamp (N,) from its nearest reporting instant, at a rate as in slots_array."""
     frac_ns = time_ns % NS

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,60 @@ from pmutools.c37118.constants import Stat
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
+
+
+class Gist(NamedTuple):
+    """What of N data frames is measured, before anything is computed: some 30 bytes a frame."""
+
+    time_ns: Ints
+    arrival_ns: Ints
+    stamp_source: npt.NDArray[np.uint8]
+    time_quality: npt.NDArray[np.uint8]
+    stat: npt.NDArray[np.uint16]
+    """(N, S)."""
+    valid: Flags
+    """(N,) at all stations."""
+    absent: Flags | None
+    """(N,) some frequency or phasor is NaN; None: none is."""
+    mark: npt.NDArray[np.uint32]
+    """(N,) equal for equal frames: what tells a duplicate from a second frame of the same stamp."""
+
+    @property
+    def frames(self) -> int:
+        return len(self.time_ns)
+
+
+def gist_of(batch: Batch) -> Gist:
+    """The columns of a batch, most of them shared with it; its values and its wire are let go."""
+    absent: Flags | None = None
+    valid: Flags = batch.valid[:, 0] if batch.valid.shape[1] == 1 else np.logical_and.reduce(batch.valid, axis=1)
+    if np.isnan(batch.frequency.sum()) or (batch.phasors.size and np.isnan(batch.phasors.view(np.float64).sum())):
+        absent = np.logical_or(np.isnan(batch.frequency).any(1), np.isnan(batch.phasors).any(1))
+    return Gist(
+        batch.time_ns,
+        batch.arrival_ns,
+        batch.stamp_source,
+        batch.time_quality,
+        batch.stat,
+        valid,
+        absent,
+        _marks(batch),
+    )
+
+
+def gathered(parts: Sequence[Gist]) -> Gist:
+    """One after the other; of the same number of stations."""
+    if len(parts) == 1:
+        return parts[0]
+    absent = None
+    if any(part.absent is not None for part in parts):
+        absent = np.concatenate(
+            [np.zeros(part.frames, np.bool_) if part.absent is None else part.absent for part in parts]
+        )
+    columns = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in Gist._fields if name != "absent"
+    }
+    return Gist(absent=absent, **columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,43 +88,47 @@ class Frames:
     """(N,) MSG_TQ says locked, and no station's STAT says not synchronised, or unlocked for 10 s or longer."""
     stamp_source: npt.NDArray[np.uint8]
     """(N,) index into :data:`~pmutools.c37118.batch.STAMP_SOURCES`."""
+    stat: npt.NDArray[np.uint16]
+    """(N,) the bits that any of the stations sets."""
     mark: npt.NDArray[np.uint32]
-    """(N,) equal for equal frames: what tells a duplicate from a second frame of the same stamp."""
+    """(N,) as of :class:`Gist`."""
 
     def __len__(self) -> int:
         return len(self.slot)
 
     def __getitem__(self, rows: slice | Flags) -> Frames:
-        return Frames(*(getattr(self, item.name)[rows] for item in fields(self)))
+        return Frames(*(getattr(self, name)[rows] for name in _FRAMES))
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
     """One after the other."""
     if len(parts) == 1:
         return parts[0]
-    return Frames(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(Frames)))
+    return Frames(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FRAMES))
 
 
+_FRAMES = tuple(item.name for item in fields(Frames))
 _UNLOCKED = 0x0030
 
 
-def frames_of(batch: Batch, stat: npt.NDArray[np.uint16], rate: Fraction, counted: int = 0) -> Frames:
-    """The columns of a batch, ``stat`` as of :func:`any_station`.
+def frames_of(gist: Gist, rate: Fraction, counted: int = 0) -> Frames:
+    """What the meters look at of a gist.
 
     Without a rate every frame has a slot of its own, from ``counted`` up: none is missed.
     """
     if rate:
-        slot = timebase.slots_array(batch.time_ns, rate)
-        off_grid = timebase.grid_offset_array(batch.time_ns, rate)
+        slot = timebase.slots_array(gist.time_ns, rate)
+        off_grid = timebase.grid_offset_array(gist.time_ns, rate)
     else:
-        slot = np.arange(counted, counted + len(batch))
-        off_grid = np.zeros(len(batch), np.int64)
-    delay = batch.arrival_ns - batch.time_ns
-    if (unknown := batch.arrival_ns == NO_TIME).any():
+        slot = np.arange(counted, counted + gist.frames)
+        off_grid = np.zeros(gist.frames, np.int64)
+    delay = gist.arrival_ns - gist.time_ns
+    if (unknown := gist.arrival_ns == NO_TIME).any():
         delay[unknown] = NO_TIME
-    synchronised = (batch.time_quality & 0xF == 0) & (stat & np.uint16(Stat.NOT_SYNCHRONISED | _UNLOCKED) == 0)
+    stat = any_station(gist.stat)
+    synchronised = (gist.time_quality & 0xF == 0) & (stat & np.uint16(Stat.NOT_SYNCHRONISED | _UNLOCKED) == 0)
     return Frames(
-        slot, off_grid, batch.time_ns, batch.arrival_ns, delay, synchronised, batch.stamp_source, _marks(batch)
+        slot, off_grid, gist.time_ns, gist.arrival_ns, delay, synchronised, gist.stamp_source, stat, gist.mark
     )
 
 

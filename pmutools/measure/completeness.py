@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ from pmutools.measure.histogram import NS_PER_MS, Histogram, ms
 BUDGET_BYTES = 32 << 20
 """What the arrivals that are compared may take; how many stamps that is depends on the number of streams."""
 _LONGEST = 1 << 15
+_AT_ONCE = 1 << 19
+"""Arrivals that are judged together."""
 _LATEST = np.iinfo(np.int64).max
 _SHARES: tuple[float, ...] = (*np.linspace(0.0, 1.0, 41).tolist(), 0.99, 0.995, 0.999, 0.9999)
 
@@ -87,22 +90,56 @@ class Alignment:
     """Compares arrivals of streams that report at the same instants.
 
     Streams may be added in any order and at their own pace, as long as they stay within 3/4 of ``stamps`` instants of
-    each other. A stamp is judged once the newest is about that far ahead, or at the end.
+    each other. A stamp is judged once the newest is about that far ahead, or at the end, by the streams that had begun.
+    Memory: ``budget_bytes``, however many streams join.
     """
 
     def __init__(self, names: Sequence[str], rate: Fraction, budget_bytes: int = BUDGET_BYTES) -> None:
-        count = max(1, len(names))
-        size = min(_LONGEST, max(64, budget_bytes // (8 * count)))
-        self.stamps = 1 << (size.bit_length() - 1)
-        self.names, self.rate = tuple(names), rate
+        self.names, self.rate = list(names), rate
         self.counts = AlignmentCounts()
         self.stragglers = [Straggler() for _ in names]
-        self._arrivals = np.full((self.stamps, len(names)), _LATEST)
-        self._joined = np.full(len(names), _LATEST)
+        self._budget_bytes = budget_bytes
+        count = max(1, len(names))
+        self.stamps = self._size(count)
+        self._arrivals = np.full((self.stamps, count), _LATEST)
+        self._joined = np.full(count, _LATEST)
         """The first slot of each stream; before it nothing is expected."""
-        self._heads = np.full(len(names), NO_TIME)
+        self._heads = np.full(count, NO_TIME)
+        self._running = list(range(len(names)))
         self._settled: int | None = None
         self._head = 0
+
+    def _size(self, streams: int) -> int:
+        size = min(_LONGEST, max(64, self._budget_bytes // (8 * streams)))
+        return 1 << (size.bit_length() - 1)
+
+    def join(self, name: str) -> int:
+        """Another stream; its place."""
+        place = len(self.names)
+        if place >= self._arrivals.shape[1]:
+            self._widen(2 * place)
+        self.names.append(name)
+        self.stragglers.append(Straggler())
+        self._running.append(place)
+        return place
+
+    def leave(self, stream: int) -> None:
+        """Nothing more is expected of a stream; stamps that are not judged yet do without it."""
+        self._running.remove(stream)
+
+    def _widen(self, streams: int) -> None:
+        """Room for so many; the ring becomes shorter where memory would not do."""
+        size, before = self._size(streams), self._arrivals.shape[1]
+        if self._settled is not None:
+            self._settle(self._head - size)
+        arrivals = np.full((size, streams), _LATEST)
+        if self._settled is not None:
+            kept = np.arange(self._settled + 1, self._head + 1)
+            arrivals[kept & (size - 1), :before] = self._arrivals[kept & (self.stamps - 1)]
+        self.stamps, self._arrivals = size, arrivals
+        more = streams - before
+        self._joined = np.concatenate((self._joined, np.full(more, _LATEST)))
+        self._heads = np.concatenate((self._heads, np.full(more, NO_TIME)))
 
     def add(self, stream: int, slot: Ints, arrival_ns: Ints) -> None:
         """Unique frames (N,) of a stream, by its place in ``names``, in order of arrival."""
@@ -158,7 +195,7 @@ class Alignment:
         first = self._settled + 1
         while first <= upto:
             start = first & (self.stamps - 1)
-            count = min(upto - first + 1, self.stamps - start, 4096)
+            count = min(upto - first + 1, self.stamps - start, max(64, _AT_ONCE // len(self._joined)))
             block = self._arrivals[start : start + count]
             self._judge(first, block)
             block[...] = _LATEST
@@ -166,28 +203,32 @@ class Alignment:
         self._settled = max(self._settled, upto)
 
     def _judge(self, first: int, block: Ints) -> None:
-        """Stamps from slot ``first`` on, arrivals (K, streams)."""
-        number = len(self.names)
-        slots = np.arange(first, first + len(block))
-        due = slots[:, None] >= self._joined[None, :]
-        came = block != _LATEST
-        wanted = due.sum(1)
-        counted = wanted > 0
-        complete = counted & (came.sum(1) == wanted) & (wanted == number)
-        self.counts.stamps += int(np.count_nonzero(counted))
-        for stream, (expected, here) in enumerate(zip(due.sum(0).tolist(), came.sum(0).tolist(), strict=True)):
+        """Stamps from slot ``first`` on, arrivals (K, streams): piece by piece in which the same streams are due."""
+        joined = [(int(self._joined[stream]), stream) for stream in self._running]
+        end = first + len(block)
+        cuts = sorted({first, end, *(slot for slot, _ in joined if first < slot < end)})
+        for low, high in pairwise(cuts):
+            due = [stream for slot, stream in joined if slot <= low]
+            if due:
+                self._judge_piece(low, block[low - first : high - first, due], due)
+
+    def _judge_piece(self, first: int, block: Ints, due: Sequence[int]) -> None:
+        """Stamps whose frames of the streams ``due`` (S) are expected, arrivals (K, S)."""
+        number, came = len(due), block != _LATEST
+        complete = came.all(1)
+        self.counts.stamps += len(block)
+        for stream, here in zip(due, came.sum(0).tolist(), strict=True):
             straggler = self.stragglers[stream]
-            straggler.expected += expected
+            straggler.expected += len(block)
             straggler.stamps += here
-            straggler.missing += expected - here
+            straggler.missing += len(block) - here
         rows = np.flatnonzero(complete)
         if not rows.size:
             return
         self.counts.complete += len(rows)
         full = block[rows]
         earliest, latest, last = full.min(1), full.max(1), full.argmax(1)
-        stamps_ns = np.array([timebase.slot_time_ns(first, self.rate)]) + _since(slots[rows], first, self.rate)
-        self.counts.absolute.add(latest - stamps_ns)
+        self.counts.absolute.add(latest - timebase.slot_times_array(rows + first, self.rate))
         self.counts.relative.add(latest - earliest)
         second = np.partition(full, number - 2, axis=1)[:, number - 2] if number > 1 else latest
         cost = latest - second
@@ -195,18 +236,20 @@ class Alignment:
         times = np.bincount(last[alone], minlength=number).tolist()
         costs = np.bincount(last[alone], cost[alone], minlength=number).tolist()
         lags = full - earliest[:, None]
-        for stream, straggler in enumerate(self.stragglers):
-            straggler.last += times[stream]
-            straggler.cost_ns += round(costs[stream])
-            straggler.lag.add(lags[:, stream])
+        for column, stream in enumerate(due):
+            straggler = self.stragglers[stream]
+            straggler.last += times[column]
+            straggler.cost_ns += round(costs[column])
+            straggler.lag.add(lags[:, column])
 
     def close(self, wait_ns: int) -> None:
         """The end: judge what is left, up to the newest stamp that the slowest stream that still runs has reached."""
         if self._settled is None:
             return
         slack = int(wait_ns * self.rate / timebase.NS) + 1
-        running = self._heads[self._heads >= self._head - slack]
-        self._settle(int(running.min()) if running.size else self._head)
+        heads = self._heads[self._running]
+        heads = heads[heads >= self._head - slack]
+        self._settle(int(heads.min()) if heads.size else self._head)
 
     def table(self) -> list[Row]:
         """The streams, most often last first."""
@@ -232,10 +275,3 @@ class Alignment:
             "relative_ms": counts.relative.summary_ms(),
             "stragglers": [row._asdict() for row in self.table()],
         }
-
-
-def _since(slots: Ints, first: int, rate: Fraction) -> Ints:
-    """Time of each slot after slot ``first`` in ns; off by less than a nanosecond for every 10**9 of them."""
-    ticks: Ints = (slots - first) * (rate.denominator * timebase.NS)
-    since: Ints = (ticks + rate.numerator // 2) // rate.numerator
-    return since

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.c37118.batch import STAMP_SOURCES, Batch
+from pmutools.c37118.batch import STAMP_SOURCES
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import (
     DataError,
@@ -31,7 +31,7 @@ from pmutools.c37118.constants import (
     stat_unlocked_time,
 )
 from pmutools.flow import StampSource
-from pmutools.measure.columns import Flags
+from pmutools.measure.columns import Frames, Gist
 from pmutools.measure.counts import LARGEST, Counts
 
 _FLAGS = (Stat.NOT_SYNCHRONISED, Stat.SORTED_BY_ARRIVAL, Stat.TRIGGER, Stat.CONFIG_CHANGE, Stat.DATA_MODIFIED)
@@ -151,40 +151,37 @@ class QualityCounts(Counts):
 
 
 class QualityMeter:
-    """Counts what frames say, from batches in order of arrival."""
+    """Counts what frames say, from frames in order of arrival."""
 
     def __init__(self) -> None:
         self.counts = QualityCounts()
-        self._config: StreamConfig | None = None
+        self.config: StreamConfig | None = None
         self._last: tuple[int, bool] | None = None
 
-    def add(self, batch: Batch, stat: npt.NDArray[np.uint16], synchronised: Flags) -> None:
-        """Count a batch; ``stat`` and ``synchronised`` as of :mod:`pmutools.measure.columns`."""
+    def add(self, gist: Gist, frames: Frames) -> None:
+        """Count frames, which are the same in both forms."""
         counts = self.counts
-        self._configured(batch.config)
-        counts.frames += len(batch)
-        usable = synchronised
-        if not batch.valid.all():
-            valid = batch.valid.all(1)
-            counts.invalid += int(np.count_nonzero(~valid))
-            usable = usable & valid
-        if np.isnan(batch.frequency.sum()) or (batch.phasors.size and np.isnan(batch.phasors.view(np.float64).sum())):
-            absent = np.isnan(batch.frequency).any(1) | np.isnan(batch.phasors).any(1)
-            counts.absent += int(np.count_nonzero(absent))
-            usable = usable & ~absent
+        counts.frames += gist.frames
+        usable = frames.synchronised
+        if not gist.valid.all():
+            counts.invalid += int(np.count_nonzero(~gist.valid))
+            usable = usable & gist.valid
+        if gist.absent is not None:
+            counts.absent += int(np.count_nonzero(gist.absent))
+            usable = usable & ~gist.absent
         counts.usable += int(np.count_nonzero(usable))
-        _count(counts.time_quality, batch.time_quality)
-        _count(counts.source, batch.stamp_source)
-        first = batch.stat[0]
-        alike = bool((batch.stat == first).all())
+        _count(counts.time_quality, gist.time_quality)
+        _count(counts.source, gist.stamp_source)
+        first = gist.stat[0]
+        alike = bool((gist.stat == first).all())
         for number, word in enumerate(first.tolist()):
-            found = {word: len(batch)} if alike else {}
+            found = {word: gist.frames} if alike else {}
             if not alike:
-                _count(found, batch.stat[:, number])
-            for seen, frames in found.items():
-                counts.stat[number, seen] = counts.stat.get((number, seen), 0) + frames
-        code = batch.time_quality & 0xF
-        sync = stat & np.uint16(Stat.NOT_SYNCHRONISED) == 0
+                _count(found, gist.stat[:, number])
+            for seen, count in found.items():
+                counts.stat[number, seen] = counts.stat.get((number, seen), 0) + count
+        code = gist.time_quality & 0xF
+        sync = frames.stat & np.uint16(Stat.NOT_SYNCHRONISED) == 0
         counts.time_quality_changes += int(np.count_nonzero(code[1:] != code[:-1]))
         counts.sync_changes += int(np.count_nonzero(sync[1:] != sync[:-1]))
         if self._last is not None:
@@ -192,14 +189,15 @@ class QualityMeter:
             counts.sync_changes += self._last[1] != bool(sync[0])
         self._last = int(code[-1]), bool(sync[-1])
 
-    def _configured(self, config: StreamConfig) -> None:
-        if self._config is config:
+    def configured(self, config: StreamConfig) -> None:
+        """What comes next is ruled by ``config``."""
+        if self.config is config:
             return
-        if self._config is not None and config != self._config:
+        if self.config is not None and config != self.config:
             self.counts.config_changes += 1
-            counted = ([station.cfgcnt for station in each.stations] for each in (self._config, config))
+            counted = ([station.cfgcnt for station in each.stations] for each in (self.config, config))
             self.counts.cfgcnt_changes += next(counted) != next(counted)
-        self._config = config
+        self.config = config
 
 
 def _count(found: dict[int, int], codes: npt.NDArray[np.unsignedinteger[Any]]) -> None:

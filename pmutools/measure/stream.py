@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME, Batch
 from pmutools.c37118.config import StreamConfig
-from pmutools.measure.columns import Frames, Ints, any_station, frames_of, joined
+from pmutools.measure.columns import Frames, Gist, Ints, frames_of, gathered, gist_of
 from pmutools.measure.counts import Counts
 from pmutools.measure.delay import DelayCounts, DelayMeter
 from pmutools.measure.floor import Course
@@ -127,6 +127,10 @@ class Seen(NamedTuple):
     state: npt.NDArray[np.uint8]
     """(N,) index into :data:`STATES`."""
     lost: Ints
+    stat: npt.NDArray[np.uint16]
+    """(N,) the bits of STAT that any of the stations sets."""
+    rate: Fraction
+    """By which slots are counted."""
 
     def unique(self) -> tuple[Ints, Ints]:
         """Slots and arrivals of the frames that were the first of their slots: what an alignment of streams takes."""
@@ -163,9 +167,12 @@ class StreamMeter:
         self._last_arrival_ns: int | None = None
         self._silences: list[Silence] = []
         self._counted, self._gather = 0, gather
-        self._gathered: list[Frames] = []
+        self._gathered: list[Gist] = []
+        self._waiting = 0
+        self._closed = False
         self._rate = config.rate
         self._delays = DelayMeter(self._slots.period_ns, wait_ns)
+        self._quality.configured(config)
         self._begin_counts()
 
     @property
@@ -186,27 +193,36 @@ class StreamMeter:
         found = []
         if batch.config is not self.config and batch.config != self.config:
             found = self._reconfigure(batch.config)
-        stat = any_station(batch.stat)
-        frames = frames_of(batch, stat, self._rate, self._counted)
-        self._counted += len(batch)
-        self._quality.add(batch, stat, frames.synchronised)
-        self._note_times(frames)
-        self._gathered.append(frames)
-        return found + (self.drain() if sum(map(len, self._gathered)) >= self._gather else [])
+        self._gathered.append(gist_of(batch))
+        self._waiting += len(batch)
+        return found + (self.drain() if self._waiting >= self._gather else [])
 
     def drain(self) -> list[Seen]:
         """Count the frames gathered so far, and tell of them."""
         if not self._gathered:
             return []
-        frames, self._gathered = joined(self._gathered), []
+        gist, self._gathered, self._waiting = gathered(self._gathered), [], 0
+        frames = frames_of(gist, self._rate, self._counted)
+        self._counted += gist.frames
+        self._quality.add(gist, frames)
+        self._note_times(frames)
         return list(map(self._take, self._slots.feed(frames)))
 
+    def clock_stepped(self) -> list[Seen]:
+        """The receiver's clock was set: what came before says nothing of what is late, or between two arrivals."""
+        found = self.drain()
+        self._windows.restart(self._rate)
+        self._delays.restart(self._slots.period_ns)
+        self._last_arrival_ns = None
+        return found
+
     def _reconfigure(self, config: StreamConfig) -> list[Seen]:
-        rate = self.config.rate
-        self.config = config
+        found = self.drain()
+        rate, self.config = self.config.rate, config
+        self._quality.configured(config)
         if config.rate == rate:
-            return []
-        found = self.drain() + self._flush()
+            return found
+        found += self._flush()
         self._rate = config.rate
         self._slots.restart(self._rate)
         self._windows.restart(self._rate)
@@ -218,7 +234,9 @@ class StreamMeter:
         found = list(map(self._take, self._slots.flush()))
         nothing = np.zeros(0, np.int64)
         none = np.zeros(0, np.uint8)
-        return [*found, Seen(nothing, nothing, nothing, nothing, none, none, self._slots.close())]
+        lost = self._slots.close()
+        stat = np.zeros(0, np.uint16)
+        return [*found, Seen(nothing, nothing, nothing, nothing, none, none, lost, stat, self._rate)]
 
     def _note_times(self, frames: Frames) -> None:
         if self._first_ns is None:
@@ -245,14 +263,18 @@ class StreamMeter:
     def _take(self, part: Part) -> Seen:
         verdict, frames, placed, lost = part
         if placed is None:
-            return _seen(frames, np.full(len(frames), STATES.index(State.STALE), np.uint8), lost)
+            return self._seen(frames, np.full(len(frames), STATES.index(State.STALE), np.uint8), lost)
         if verdict is Verdict.RESTART:
             self._delays.restart(self._slots.period_ns)
         firsts = frames if placed.first.all() else frames[placed.first]
         self._delays.add(firsts, placed.ipdv_ns)
         unseen = firsts.arrival_ns == NO_TIME
         self._windows.add(firsts.arrival_ns[~unseen] if unseen.any() else firsts.arrival_ns)
-        return _seen(frames, self._states(frames, placed), lost)
+        return self._seen(frames, self._states(frames, placed), lost)
+
+    def _seen(self, frames: Frames, state: npt.NDArray[np.uint8], lost: Ints) -> Seen:
+        columns = (frames.slot, frames.time_ns, frames.arrival_ns, frames.delay_ns, frames.stamp_source)
+        return Seen(*columns, state, lost, frames.stat, self._rate)
 
     def _states(self, frames: Frames, placed: Placed) -> npt.NDArray[np.uint8]:
         """(N,) the gravest state of each frame."""
@@ -274,17 +296,25 @@ class StreamMeter:
         self._begin_counts()
         return counts
 
+    def close(self) -> list[Seen]:
+        """The end of the stream: settle all that is open, and tell of it. Nothing may be added after."""
+        found = self.drain() + self._flush()
+        self._windows.close()
+        self.take_interval()
+        self._closed = True
+        return found
+
     def result(self, end_ns: int | None = None) -> StreamResult:
         """All so far, as if the stream ended here (``end_ns``: now, in the receiver's time). It may go on after."""
-        open_ = deepcopy(self, {id(self.config): self.config, id(self._quality._config): self._quality._config})
-        open_.drain()
-        open_._flush()
-        open_._windows.close()
-        open_.take_interval()
+        if not self._closed:
+            same = {id(config): config for config in (self.config, self._quality.config)}
+            after = deepcopy(self, same)
+            after.close()
+            return after.result(end_ns)
         return StreamResult(
             self.identity,
             self.config,
-            open_._total,
+            self._total,
             self._rate,
             self._delays.wait_ns,
             round(self._slots.reach * self._slots.period_ns),
@@ -293,10 +323,6 @@ class StreamMeter:
             self._first_arrival_ns,
             self._last_arrival_ns,
             tuple(self._silences),
-            open_._delays.floor.course(),
+            self._delays.floor.course(),
             end_ns,
         )
-
-
-def _seen(frames: Frames, state: npt.NDArray[np.uint8], lost: Ints) -> Seen:
-    return Seen(frames.slot, frames.time_ns, frames.arrival_ns, frames.delay_ns, frames.stamp_source, state, lost)

@@ -6,15 +6,14 @@ When the run outgrows the buckets, neighbours are merged and each is twice as wi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
 
 from pmutools import timebase
-from pmutools.c37118.batch import NO_TIME, Batch
+from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, Stat
-from pmutools.measure.columns import Ints, any_station
+from pmutools.measure.columns import Ints
 from pmutools.measure.stream import STATES, Seen, State
 
 BUCKETS = 1024
@@ -53,7 +52,7 @@ class Course:
 
 
 class Timeline:
-    """Takes what a :class:`~pmutools.measure.stream.StreamMeter` has seen, and the batches it was given."""
+    """Takes what a :class:`~pmutools.measure.stream.StreamMeter` has seen."""
 
     def __init__(self, buckets: int = BUCKETS, first_width_ns: int = FIRST_WIDTH_NS) -> None:
         """``buckets`` is even."""
@@ -64,19 +63,16 @@ class Timeline:
         self._lag_ns = 0
         """Arrival less stamp of the last frame: when a lost one would have come."""
 
-    def add_batch(self, batch: Batch) -> None:
-        """The quality of frames (N,), in order of arrival."""
-        times = np.where(batch.arrival_ns == NO_TIME, batch.time_ns, batch.arrival_ns)
-        at = self._place(times)
-        stat = any_station(batch.stat)
-        self._count("frames", at)
-        for name, bits in (("unsynchronised", int(Stat.NOT_SYNCHRONISED)), ("unusable", STAT_DATA_ERROR_MASK)):
-            hit = stat & np.uint16(bits) != 0
-            if hit.any():
-                self._count(name, at[hit])
-
-    def add(self, seen: Seen, rate: Fraction) -> None:
-        """The fates of frames, in order of arrival, and of the lost."""
+    def add(self, seen: Seen) -> None:
+        """What became of frames, in order of arrival, and of the lost."""
+        came = np.where(seen.arrival_ns == NO_TIME, seen.time_ns, seen.arrival_ns)
+        if len(came):
+            at = self._place(came)
+            self._count("frames", at)
+            for name, bits in (("unsynchronised", int(Stat.NOT_SYNCHRONISED)), ("unusable", STAT_DATA_ERROR_MASK)):
+                hit = seen.stat & np.uint16(bits) != 0
+                if hit.any():
+                    self._count(name, at[hit])
         known = (seen.arrival_ns != NO_TIME) & (seen.state <= STATES.index(State.LATE))
         if known.any():
             delay = seen.delay_ns[known]
@@ -86,13 +82,12 @@ class Timeline:
             self._sums["total_ns"] += np.bincount(at, delay, self._buckets).astype(np.int64)
             np.minimum.at(self._least, at, delay)
             np.maximum.at(self._most, at, delay)
-        came = np.where(seen.arrival_ns == NO_TIME, seen.time_ns, seen.arrival_ns)
         for name, states in (("late", (State.LATE,)), ("duplicated", (State.DUPLICATE, State.CONFLICTING))):
             hit = np.isin(seen.state, [STATES.index(state) for state in states])
             if hit.any():
                 self._count(name, self._place(came[hit]))
-        if len(seen.lost) and rate:
-            due = (seen.lost * (rate.denominator * timebase.NS)) // rate.numerator + self._lag_ns
+        if len(seen.lost) and seen.rate:
+            due = timebase.slot_times_array(seen.lost, seen.rate) + self._lag_ns
             self._count("lost", self._place(due))
 
     def course(self) -> Course | None:

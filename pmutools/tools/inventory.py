@@ -14,7 +14,7 @@ from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, FrameType, Stat
 from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.source import Block, Source
-from pmutools.measure.columns import any_station, frames_of
+from pmutools.measure.columns import frames_of, gist_of
 from pmutools.measure.slotmeter import SlotMeter
 from pmutools.measure.slots import HORIZON_S, SlotCounts
 from pmutools.tools.describe import describe_station
@@ -82,7 +82,7 @@ class StreamInventory:
         for code, count in zip(*np.unique(batch.time_quality & 0xF, return_counts=True), strict=True):
             self.time_quality[int(code)] = self.time_quality.get(int(code), 0) + int(count)
         if rate := self.config.rate:
-            for _ in self._meter.feed(frames_of(batch, any_station(batch.stat), rate)):
+            for _ in self._meter.feed(frames_of(gist_of(batch), rate)):
                 pass
 
     def close(self) -> None:

@@ -74,8 +74,29 @@ def test_a_stream_that_joins_late_is_not_missed_before() -> None:
     alignment.add(0, slot, arrival)
     alignment.add(1, slot[500:], arrival[500:])
     alignment.close(200 * MS)
-    assert alignment.counts.complete == 500
+    assert (alignment.counts.complete, alignment.counts.stamps) == (1000, 1000)
     assert alignment.stragglers[1].missing == 0
+
+
+@pytest.mark.parametrize("budget_bytes", [32 << 20, 4096])
+def test_streams_join_and_leave_while_it_runs(budget_bytes: int) -> None:
+    """One more every 50 stamps, 5 ms later than all before; the first leaves."""
+    alignment = Alignment((), RATE, budget_bytes)
+    slot, arrival = arrivals(np.full(500, 20.0))
+    for at in range(500):
+        if at % 50 == 0:
+            assert alignment.join(f"S{at // 50}") == at // 50
+        if at == 450:
+            alignment.leave(0)
+        for stream in range(int(at >= 450), at // 50 + 1):
+            alignment.add(stream, slot[at : at + 1], arrival[at : at + 1] + stream * 5 * MS)
+    alignment.close(0)
+    counts = alignment.counts
+    assert alignment._arrivals.nbytes <= max(budget_bytes, 64 * 8 * 16)
+    assert counts.outside == 0
+    assert counts.complete == counts.stamps >= 450  # in the first 50 there was but the stream that left
+    assert counts.absolute.max_ns == 65 * MS and alignment.stragglers[0].expected <= 450
+    assert sum(straggler.missing for straggler in alignment.stragglers) == 0
 
 
 def test_a_silence_of_all_and_a_set_clock_cost_nothing() -> None:
