@@ -10,6 +10,7 @@ IPDV           RFC 3393, 5481 D of a slot less D of the slot before it, signed; 
 PDV            RFC 5481       D less its floor, the least D of the last minute: what a concentrator must wait for
 jitter         RFC 3550       J += (\\|D(i) - D(i-1)\\| - J)/16 in order of arrival; remembers some 50 frames
 p95 - p50      OWAMP          what ``owping`` calls jitter
+correlation    von Neumann    of the delays of slots that follow each other: near 1 where they wait in a queue
 inter-arrival                 R less the R before it: no clock but the receiver's own comes in
 ============== ============== ================================================================================
 """
@@ -23,6 +24,7 @@ import numpy as np
 from pmutools.c37118.batch import NO_TIME
 from pmutools.measure.columns import Frames, Ints
 from pmutools.measure.counts import Counts, Tally
+from pmutools.measure.evenness import EvennessCounts, EvennessMeter
 from pmutools.measure.floor import FloorMeter
 from pmutools.measure.histogram import Histogram
 from pmutools.timebase import NS
@@ -58,10 +60,19 @@ class DelayCounts(Counts):
     """Delays that changed by a second, within 50 ms, from a frame to the next."""
     slot_steps: Tally = field(default_factory=Tally)
     """By how many slots frames that came in order follow each other."""
+    evenness: EvennessCounts = field(default_factory=EvennessCounts)
     multiples: dict[int, int] = field(default_factory=dict)
     """How many arrivals are whole multiples of each of :data:`RESOLUTIONS_NS`."""
     jitter_ns: float = field(default=0.0, metadata={"merge": lambda mine, later: later or mine})
     """RFC 3550's, at the last frame."""
+
+    @property
+    def correlation(self) -> float | None:
+        """Of the delays of slots that follow each other: 1 - E[IPDV²] / (2 Var[D]), von Neumann's ratio."""
+        spread, step, mean = self.delay.sd_ns, self.ipdv.sd_ns, self.ipdv.mean_ns
+        if not spread or step is None or mean is None or self.ipdv.count < 50:
+            return None
+        return max(-1.0, 1 - (step * step + mean * mean) / (2 * spread * spread))
 
     @property
     def owamp_jitter_ns(self) -> float | None:
@@ -75,7 +86,7 @@ class DelayMeter:
 
     def __init__(self, period_ns: float, wait_ns: int) -> None:
         self.counts = DelayCounts()
-        self.floor = FloorMeter()
+        self.floor, self._evenness = FloorMeter(), EvennessMeter()
         self.wait_ns = wait_ns
         self._period_ns = period_ns
         self._jitter_ns = 0.0
@@ -85,6 +96,7 @@ class DelayMeter:
         """What comes next belongs to another epoch."""
         self._period_ns, self._last = period_ns, None
         self.floor.restart()
+        self._evenness.restart()
 
     def add(self, frames: Frames, ipdv_ns: Ints) -> None:
         """Unique frames, and the IPDV of pairs that they complete."""
@@ -108,6 +120,8 @@ class DelayMeter:
         for unit in RESOLUTIONS_NS:  # each a multiple of the one before
             whole = whole[whole % unit == 0]
             counts.multiples[unit] = counts.multiples.get(unit, 0) + len(whole)
+        self._evenness.counts = counts.evenness
+        self._evenness.add(frames.slot, delay)
         self._between(frames)
 
     def _between(self, frames: Frames) -> None:

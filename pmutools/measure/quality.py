@@ -226,9 +226,11 @@ class Events(Counts):
     own_drops: int = 0
     """Datagrams that this host's socket buffer had no room for: no loss of the network's."""
     connects: int = 0
-    """Connections made."""
+    """Connections made; over UDP and in recordings, sockets or connections that it came by."""
     disconnects: int = 0
-    """Connections lost."""
+    """Connections lost, or followed by another."""
+    senders: int = field(default=0, metadata=LARGEST)
+    """Most senders heard at once; 2 are one too many."""
     retransmits: int = 0
     """Of TCP, as the receiver's kernel counts them."""
     stalls: int = 0
@@ -237,6 +239,8 @@ class Events(Counts):
     """The longest of them."""
     first_config_ms: float = field(default=0.0, metadata=LARGEST)
     """From the start to the first configuration."""
+    first_data_ms: float = field(default=0.0, metadata=LARGEST)
+    """From the start to the first data frame."""
 
     def to_json(self) -> dict[str, Any]:
         return dict(vars(self))

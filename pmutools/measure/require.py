@@ -132,11 +132,12 @@ class Verdict(NamedTuple):
     stream: str
     value: float | None
     holds: bool
+    note: str = ""
 
     def __str__(self) -> str:
         unit = METRICS[self.requirement.name].unit
         if self.value is None:
-            told = "not measured"
+            told = self.note or "not measured"
         elif unit == "share":
             told = f"{self.value:.4%}"
         else:
@@ -185,7 +186,7 @@ def _nearest(name: str) -> str:
 
 
 def verdicts(requirements: Sequence[Requirement], summary: Mapping[str, Any]) -> list[Verdict]:
-    """Every limit on every stream it concerns; a scope that fits no stream raises SettingsError."""
+    """Every limit on every stream it concerns; one that concerns no stream does not hold."""
     found = []
     for requirement in requirements:
         read = METRICS[requirement.name].read
@@ -196,11 +197,10 @@ def verdicts(requirements: Sequence[Requirement], summary: Mapping[str, Any]) ->
         ]
         if not concerned and requirement.scope == "all":
             concerned = [("all", summary["all"])]
-        if not concerned and requirement.scope:
+        if not concerned:
             names = [stream["name"] for stream in summary["streams"]]
-            raise SettingsError(
-                f"--require: {requirement.text!r} concerns no stream; {suggestion(requirement.scope, [*names, 'all'])}"
-            )
+            note = f"no such stream; {suggestion(requirement.scope, [*names, 'all'])}" if names else "no stream came"
+            found.append(Verdict(requirement, requirement.scope or "all", None, False, note))
         for name, stream in concerned:
             value = read(stream)
             found.append(Verdict(requirement, name, value, requirement.holds(value)))

@@ -17,7 +17,9 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.measure.columns import Frames, Gist, Ints, frames_of, gathered, gist_of
 from pmutools.measure.counts import Counts
 from pmutools.measure.delay import DelayCounts, DelayMeter
+from pmutools.measure.evenness import RateCounts, RateMeter
 from pmutools.measure.floor import Course
+from pmutools.measure.hours import HourCounts
 from pmutools.measure.quality import Events, QualityCounts, QualityMeter
 from pmutools.measure.sequence import LossCounts, OrderCounts
 from pmutools.measure.slotmeter import Part, SlotMeter
@@ -40,6 +42,12 @@ class Identity(NamedTuple):
     idcode: int
     transport: str = ""
     multicast: bool = False
+    where: str = ""
+    """Where its frames come from, for people."""
+    wanted_hz: int | None = None
+    """The rate that the user expects."""
+    others: tuple[str, ...] = ()
+    """More names that it goes by: sites, stations."""
 
 
 class Silence(NamedTuple):
@@ -58,6 +66,8 @@ class StreamCounts(Counts):
     losses: LossCounts = field(default_factory=LossCounts)
     delays: DelayCounts = field(default_factory=DelayCounts)
     windows: WindowCounts = field(default_factory=WindowCounts)
+    rates: RateCounts = field(default_factory=RateCounts)
+    hours: HourCounts = field(default_factory=HourCounts)
     quality: QualityCounts = field(default_factory=QualityCounts)
     events: Events = field(default_factory=Events)
 
@@ -160,7 +170,7 @@ class StreamMeter:
         self._total = StreamCounts()
         self._slots = SlotMeter(config.rate, round(horizon_s * timebase.NS))
         self._quality = QualityMeter()
-        self._windows = WindowMeter(config.rate, phase_ns)
+        self._windows, self._rates = WindowMeter(config.rate, phase_ns), RateMeter()
         self._first_ns: int | None = None
         self._last_ns: int | None = None
         self._first_arrival_ns: int | None = None
@@ -183,7 +193,7 @@ class StreamMeter:
     def _begin_counts(self) -> None:
         counts, slots = self._counts, self._slots
         slots.counts, slots.order.counts, slots.losses.counts = counts.slots, counts.order, counts.losses
-        self._delays.counts, self._windows.counts = counts.delays, counts.windows
+        self._delays.counts, self._windows.counts, self._rates.counts = counts.delays, counts.windows, counts.rates
         self._quality.counts = counts.quality
 
     def add(self, batch: Batch) -> list[Seen]:
@@ -212,6 +222,7 @@ class StreamMeter:
         """The receiver's clock was set: what came before says nothing of what is late, or between two arrivals."""
         found = self.drain()
         self._windows.restart(self._rate)
+        self._rates.restart()
         self._delays.restart(self._slots.period_ns)
         self._last_arrival_ns = None
         return found
@@ -268,8 +279,14 @@ class StreamMeter:
             self._delays.restart(self._slots.period_ns)
         firsts = frames if placed.first.all() else frames[placed.first]
         self._delays.add(firsts, placed.ipdv_ns)
-        unseen = firsts.arrival_ns == NO_TIME
-        self._windows.add(firsts.arrival_ns[~unseen] if unseen.any() else firsts.arrival_ns)
+        if self._rate and len(firsts):
+            self._counts.hours.add(firsts.slot, self._rate)
+        arrivals = firsts.arrival_ns
+        if (unseen := arrivals == NO_TIME).any():
+            arrivals = arrivals[~unseen]
+        if len(arrivals):
+            self._windows.add(arrivals)
+            self._rates.add(arrivals)
         return self._seen(frames, self._states(frames, placed), lost)
 
     def _seen(self, frames: Frames, state: npt.NDArray[np.uint8], lost: Ints) -> Seen:

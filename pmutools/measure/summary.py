@@ -4,29 +4,86 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from pmutools import timebase
 from pmutools.measure.budget import budget
-from pmutools.measure.clockquality import ClockLog
+from pmutools.measure.clockquality import ClockLog, ClockQuality
 from pmutools.measure.completeness import Alignment, curve
-from pmutools.measure.diagnoses import Scene, diagnose
+from pmutools.measure.diagnoses import diagnose
 from pmutools.measure.fits import best_fit, typical
-from pmutools.measure.histogram import Histogram, ms
+from pmutools.measure.histogram import ms
+from pmutools.measure.quality import Events
+from pmutools.measure.scene import Peer, Scene, peer_of
 from pmutools.measure.stream import StreamCounts, StreamResult
 from pmutools.measure.uncertainty import uncertainty
 
 
 def summary(
-    results: Sequence[StreamResult], clock: ClockLog, alignments: Sequence[Alignment] = (), *, fits: bool = True
+    results: Sequence[StreamResult],
+    clock: ClockLog,
+    alignments: Sequence[Alignment] = (),
+    *,
+    host: Events | None = None,
+    fits: bool = True,
 ) -> dict[str, Any]:
-    """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed. A fit takes some 50 ms."""
-    streams = [stream_summary(result, clock, results, fit=fits) for result in results]
-    return _safe({"clock": clock.to_json(), "streams": streams, "all": _all(results, alignments)})
+    """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed. A fit takes some 25 ms.
+
+    ``host`` is what happened that belongs to no stream alone, with all drops of this machine's sockets: streams that
+    share one were each told of the same drops.
+    """
+    peers, whole = [peer_of(result) for result in results], Whole()
+    streams = []
+    for result in results:
+        streams.append(stream_summary(result, clock, peers, fit=fits))
+        whole.add(result)
+    return {"clock": safe(clock.to_json()), "streams": streams, "all": whole.to_json(alignments, host)}
+
+
+class Whole:
+    """All streams together, added one by one: sums, one distribution of all delays, and the alignment of stamps."""
+
+    def __init__(self) -> None:
+        self._counts, self._streams, self._silent_ns = StreamCounts(), 0, 0
+
+    def add(self, result: StreamResult) -> None:
+        """One more stream."""
+        jitter_ns = max(self._counts.delays.jitter_ns, result.counts.delays.jitter_ns)
+        self._counts.merge(result.counts)
+        self._counts.delays.jitter_ns = jitter_ns
+        self._streams += 1
+        self._silent_ns = max(self._silent_ns, result.silent_ns)
+
+    def to_json(self, alignments: Sequence[Alignment] = (), host: Events | None = None) -> dict[str, Any]:
+        """``all`` of the summary, JSON-safe."""
+        counts = self._counts
+        if host is not None:
+            events = counts.events.plus(host)
+            events.own_drops = host.own_drops
+            counts = replace(counts, events=events)
+        together = [alignment.to_json() for alignment in alignments]
+        expected = counts.slots.expected
+        return safe(
+            {
+                "streams": self._streams,
+                **_counted(counts),
+                "silent_s": self._silent_ns / timebase.NS,
+                "own_drops": counts.events.own_drops,
+                **_delays(counts, None),
+                "per_window": counts.windows.to_json(),
+                "completeness_vs_wait": together[0]["completeness_vs_wait"]
+                if len(together) == 1
+                else curve(counts.delays.delay, expected),
+                "quality": counts.quality.to_json(expected, counts.slots.received),
+                "alignment": together,
+                **_more(counts),
+            }
+        )
 
 
 def stream_summary(
-    result: StreamResult, clock: ClockLog, others: Sequence[StreamResult] = (), *, fit: bool = True
+    result: StreamResult, clock: ClockLog, others: Sequence[Peer] = (), *, fit: bool = True
 ) -> dict[str, Any]:
     """One stream's part."""
     counts, identity = result.counts, result.identity
@@ -34,10 +91,10 @@ def stream_summary(
     locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
     fitted_to, of = typical(counts.delays)
     fitted = best_fit(fitted_to) if fit else None
-    skew = result.course.skew()
+    skew, peak = result.course.skew(), counts.delays.evenness.peak(result.period_ns)
     names = [station.name for station in result.config.stations]
-    diagnoses = diagnose(Scene(result, clock, others or (result,)))
-    return _safe(
+    diagnoses = diagnose(Scene(result, clock, others))
+    return safe(
         {
             "name": identity.name,
             "idcode": identity.idcode,
@@ -56,11 +113,17 @@ def stream_summary(
             "diagnoses": [diagnosis._asdict() for diagnosis in diagnoses],
             # what follows is beyond the agreed keys
             **_more(counts),
+            "where": identity.where,
+            "other_names": list(identity.others),
             "wait_ms": ms(result.wait_ns),
             "tmax_s": result.horizon_ns / timebase.NS,
             "uncertainty": sure.to_json(),
             "uncertainty_locked_ms": ms(locked.bound_ns),
             "skew_ppm": skew.ppm if skew else None,
+            "delay_correlation": counts.delays.correlation,
+            "periodic": {"hz": peak[0], "share": peak[1]} if peak else None,
+            "allan_deviation": counts.delays.evenness.allan(result.period_ns),
+            "hours": counts.hours.to_json(result.rate),
             "floor": [
                 [start_ns, ms(least)]
                 for start_ns, least in zip(
@@ -78,10 +141,26 @@ def stream_summary(
     )
 
 
-def interval_summary(counts: StreamCounts) -> dict[str, Any]:
-    """What was counted in an interval; the delays' percentiles, without fits and diagnoses."""
-    own = {"own_drops": counts.events.own_drops, "per_window": counts.windows.to_json()}
-    return _safe({**_counted(counts), **own, **_delays(counts, None)})
+def interval_summary(counts: StreamCounts, clock: ClockQuality | None = None, period_ns: float = 0.0) -> dict[str, Any]:
+    """What was counted in an interval; the delays' percentiles, without fits and diagnoses.
+
+    ``clock`` is the receiver's at its end; without it delays have no uncertainty.
+    """
+    bound_ns = None
+    if clock is not None:
+        bound_ns = uncertainty(clock.bound_ns, clock.text, counts.quality, period_ns).bound_ns
+    return safe(
+        {
+            **_counted(counts),
+            "own_drops": counts.events.own_drops,
+            "per_window": counts.windows.to_json(),
+            **_delays(counts, bound_ns),
+            "stale": counts.slots.stale,
+            "conflicting": counts.slots.conflicting,
+            "negative": counts.delays.negative,
+            "events": counts.events.to_json(),
+        }
+    )
 
 
 def _counted(counts: StreamCounts) -> dict[str, Any]:
@@ -130,36 +209,9 @@ def _more(counts: StreamCounts) -> dict[str, Any]:
             "empty_runs": windows.empty_runs.to_json(),
             "to_tick_ms": windows.to_tick.summary_ms(),
         },
+        "rates_per_s": counts.rates.to_json(),
         "events": counts.events.to_json(),
     }
-
-
-def _all(results: Sequence[StreamResult], alignments: Sequence[Alignment]) -> dict[str, Any]:
-    """All streams together: sums, one distribution of all delays, and the alignment of stamps."""
-    counts = StreamCounts()
-    for result in results:
-        counts.merge(result.counts)
-    counts.delays.jitter_ns = max((result.counts.delays.jitter_ns for result in results), default=0.0)
-    together = [alignment.to_json() for alignment in alignments]
-    expected = counts.slots.expected
-    return {
-        "streams": len(results),
-        **_counted(counts),
-        "silent_s": max((result.silent_ns for result in results), default=0) / timebase.NS,
-        # of one socket, and so the same drops, where several streams came by it
-        "own_drops": counts.events.own_drops,
-        **_delays(counts, None),
-        "per_window": counts.windows.to_json(),
-        "completeness_vs_wait": together[0]["completeness_vs_wait"] if len(together) == 1 else _curve(counts, expected),
-        "quality": counts.quality.to_json(expected, counts.slots.received),
-        "alignment": together,
-        **_more(counts),
-    }
-
-
-def _curve(counts: StreamCounts, expected: int) -> list[list[float]]:
-    delays: Histogram = counts.delays.delay
-    return curve(delays, expected)
 
 
 def _utc(time_ns: int | None) -> str | None:
@@ -170,16 +222,16 @@ def _utc(time_ns: int | None) -> str | None:
         return None
 
 
-def _safe(told: dict[str, Any]) -> dict[str, Any]:
+def safe(told: dict[str, Any]) -> dict[str, Any]:
     """JSON has neither infinity nor NaN, and keys are text."""
-    return {str(key): _safe_value(value) for key, value in told.items()}
+    return {str(key): _safe(value) for key, value in told.items()}
 
 
-def _safe_value(value: Any) -> Any:
+def _safe(value: Any) -> Any:
     if isinstance(value, dict):
-        return _safe(value)
+        return safe(value)
     if isinstance(value, list | tuple):
-        return [_safe_value(item) for item in value]
+        return [_safe(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value

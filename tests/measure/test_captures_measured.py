@@ -39,14 +39,19 @@ def test_a_device_that_claims_to_be_locked_and_is_days_behind() -> None:
     assert (stream["expected"], stream["received"], stream["lost"]) == (252, 252, 0)
     assert stream["delay_ms"]["p50"] / 86_400_000 == pytest.approx(4.79, abs=0.01)
     assert stream["pdv_ms"]["max"] < 40
-    assert ids(stream) == {"locked-but-off"}
+    assert ids(stream) == {"locked-but-off", "odd-time-base", "trigger-stuck"}
     assert stream["fit"]["of"] == "pdv"
 
 
 def test_a_concentrator_over_tcp_that_sends_in_lumps() -> None:
     (stream,) = told("C37.118_4in1PMU_TCP.pcap")
     assert (stream["received"], stream["duplicated"], stream["reordered"]) == (1342, 0, 0)
-    assert {"tcp-batching", "uneven-arrival"} <= ids(stream)
+    assert {"tcp-batching", "uneven-arrival", "pauses", "unmasked-digitals", "zero-scale"} <= ids(stream)
+
+
+def test_a_concentrator_that_numbers_its_stream_otherwise() -> None:
+    (stream,) = told("C37.118_1PMU_UDP.pcap")
+    assert ids(stream) == {"locked-but-off", "concentrator", "unmasked-digitals"}
 
 
 def test_an_unsynchronised_device_with_usable_values() -> None:

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from support.measured import MS, START_NS, arranged, batch, config, measured, stamps
 
+from pmutools.c37118.config import AnalogChannel, DigitalWord, PhasorChannel
+from pmutools.c37118.constants import Format
 from pmutools.flow import StampSource
 from pmutools.measure.clockquality import ClockLog, ClockQuality, KernelClock
-from pmutools.measure.diagnoses import ROWS, Scene, diagnose
-from pmutools.measure.stream import Identity, StreamResult
+from pmutools.measure.diagnoses import ROWS, diagnose
+from pmutools.measure.scene import Peer, Scene, peer_of
+from pmutools.measure.stream import Identity, StreamMeter, StreamResult
 from pmutools.timebase import NS
 
 RNG = np.random.default_rng(11)
@@ -54,6 +57,10 @@ def with_events(**counted: Any) -> StreamResult:
     return result
 
 
+def peers(*results: StreamResult) -> tuple[Peer, ...]:
+    return tuple(map(peer_of, results))
+
+
 def silent_after(seconds: float) -> StreamResult:
     count = int(seconds * 60)
     return stream(count, identity=MULTICAST, end_ns=START_NS + round((seconds + 120) * NS))
@@ -72,6 +79,40 @@ def leapt(by_s: float = 1.0) -> StreamResult:
     return measured(batch(times, delay))
 
 
+def nothing(**counted: Any) -> StreamResult:
+    meter = StreamMeter(Identity("N1", 101, "udp", where="udp://192.0.2.1:4713"), config())
+    for name, value in counted.items():
+        setattr(meter.events, name, value)
+    return meter.result()
+
+
+def quirky(**said: Any) -> StreamResult:
+    """A stream whose station says something odd."""
+    of = config()
+    return stream(600, of=replace(of, stations=(replace(of.stations[0], **said),)))
+
+
+def reconfigured(cfgcnt: int) -> StreamResult:
+    """Another phasor from half of the run on."""
+    frames = batch(stamps(range(1200)), 44 + noise(1200))
+    other = batch(stamps(range(1200, 2400)), 44 + noise(1200), of=config(phasors=2, cfgcnt=cfgcnt))
+    return measured([arranged(frames), arranged(other)])
+
+
+def stored() -> StreamResult:
+    """A link that holds frames back for 12 s and then sends them all."""
+    delay = 44 + noise()
+    held = np.arange(720)
+    delay[3000:3720] += (720 - held) * 1000 / 60
+    return measured(arranged(batch(stamps(range(COUNT)), delay)))
+
+
+def smeared() -> StreamResult:
+    """A leap second that the receiver's time server spreads over a day, seen for 400 s of it."""
+    count = 24_000
+    return stream(count, delay_ms=44 + np.arange(count) / 60 * 0.0116, time_quality=0x20)
+
+
 HEALTHY: dict[str, Scene] = {
     "plain": Scene(stream(), clock()),
     "tcp": Scene(stream(identity=TCP), clock()),
@@ -83,7 +124,7 @@ HEALTHY: dict[str, Scene] = {
     "slow": Scene(stream(rate=10), clock()),
     "short": Scene(stream(20), clock()),
     "no arrivals": Scene(measured(batch(stamps(range(600)), None)), clock()),
-    "a PMU alone at two rates": Scene(stream(), clock(), (stream(), stream(rate=30))),
+    "a PMU alone at two rates": Scene(stream(), clock(), peers(stream(), stream(rate=30))),
 }  # fmt: skip
 
 sawtooth = np.where(np.arange(COUNT) % 2 == 0, 16.0, 0.0)
@@ -116,7 +157,7 @@ SICK: dict[str, tuple[Scene, str]] = {
         "one reporting period",
     ),
     "delay-of-a-period everywhere": (
-        Scene(stream(delay_ms=1.5 * 1000 / 60), clock(), (stream(delay_ms=1.5 * 1000 / 60), at_30)),
+        Scene(stream(delay_ms=1.5 * 1000 / 60), clock(), peers(stream(delay_ms=1.5 * 1000 / 60), at_30)),
         "grows with 1/Fs",
     ),
     "stale-frames": (
@@ -150,6 +191,34 @@ SICK: dict[str, tuple[Scene, str]] = {
     ),
     "coarse-stamps base": (Scene(stream(of=replace(config(), time_base=1000)), clock()), "told to 1 ms"),
     "uneven-arrival": (Scene(stream(delay_ms=44 + sawtooth), clock()), "arrival is uneven"),
+    "leap-smear": (Scene(smeared(), clock()), "smears the leap second"),
+    "silent": (Scene(nothing(), clock()), "not a single frame came at udp://192.0.2.1:4713"),
+    "silent unconfigured": (Scene(nothing(before_config=7), clock()), "7 data frames came"),
+    "silent corrupt": (Scene(nothing(corrupt=7), clock()), "7 frames with a wrong CHK"),
+    "unexpected-rate": (
+        Scene(stream(rate=30, identity=Identity("N1", 101, wanted_hz=60)), clock()),
+        "60 frames/s are expected",
+    ),
+    "config-changed": (Scene(reconfigured(cfgcnt=0), clock()), "CFGCNT did not tell"),
+    "config-changed counted": (Scene(reconfigured(cfgcnt=1), clock()), "each counted by CFGCNT"),
+    "odd-time-base": (Scene(stream(of=replace(config(), time_base=0xFFFFFF)), clock()), "16777215"),
+    "trigger-stuck": (Scene(stream(stat=0x0803), clock()), "in 100% of the frames (reason 3)"),
+    "concentrator": (Scene(quirky(idcode=61), clock()), "the stream is 101, the PMU in it 61"),
+    "unmasked-digitals": (
+        Scene(quirky(digitals=(DigitalWord(("",) * 16, valid=0),)), clock()),
+        "1 digital word(s) are sent",
+    ),
+    "zero-scale": (Scene(quirky(format=Format(0)), clock()), "PHUNIT of 1 phasor(s)"),
+    "zero-scale analogs": (Scene(quirky(analogs=(AnalogChannel("P", 0x46000000),)), clock()), "ANUNIT of 1 analog(s)"),
+    "two-senders at once": (Scene(with_events(senders=2), clock()), "2 senders feed this stream at once"),
+    "reconnects": (Scene(with_events(disconnects=2, connects=3), clock()), "2 time(s), and 3 were made"),
+    "retransmissions": (Scene(with_events(retransmits=50), clock()), "sent 50 segments again"),
+    "pauses": (Scene(slots(np.append(np.arange(6000), np.arange(6300, COUNT))), clock()), "300 frames in a row"),
+    "pauses stored": (Scene(stored(), clock()), "forwards them later"),
+    "periodic-delay": (
+        Scene(stream(delay_ms=44 + 6 * np.sin(np.arange(COUNT) * 2 * np.pi / 30)), clock()),
+        "a period of 0.5 s",
+    ),
     "late-frames": (Scene(stream(delay_ms=199.0, wait_ns=200 * MS), clock()), "99.9 %"),
 }
 
@@ -181,7 +250,7 @@ def test_every_row_has_a_case() -> None:
         ("clock-skew", SICK["latency-step"][0]),
         ("clock-skew", Scene(stream(delay_ms=44 + np.arange(COUNT) / 60 * 0.0005), clock())),
         ("latency-step", SICK["clock-skew"][0]),
-        ("delay-of-a-period", Scene(stream(delay_ms=44.0), clock(), (stream(), stream(rate=30)))),
+        ("delay-of-a-period", Scene(stream(delay_ms=44.0), clock(), peers(stream(), stream(rate=30)))),
         ("rate-mismatch", Scene(slots(np.flatnonzero(RNG.random(COUNT) > 0.4)), clock())),
         ("two-senders", SICK["rate-mismatch faster"][0]),
         ("multicast-ageing", Scene(silent_after(60), clock())),
@@ -191,6 +260,22 @@ def test_every_row_has_a_case() -> None:
         ("locked-but-off", Scene(stream(delay_ms=4.8 * 86_400_000, time_quality=0xF), clock())),
         ("locked-but-off", SICK["tai-utc"][0]),
         ("unsynchronised", Scene(stream(stat=0x0800), clock())),
+        ("leap-smear", SICK["clock-skew"][0]),
+        ("leap-smear", SICK["leap-second repeated"][0]),
+        ("unexpected-rate", Scene(stream(identity=Identity("N1", 101, wanted_hz=60)), clock())),
+        (
+            "config-changed",
+            Scene(measured([batch(stamps(range(9))), batch(stamps(range(9, 99)), of=config())]), clock()),
+        ),
+        ("trigger-stuck", Scene(stream(stat=np.where(np.arange(COUNT) < 600, 0x0800, 0)), clock())),
+        ("concentrator", SICK["odd-time-base"][0]),
+        ("zero-scale", Scene(quirky(analogs=(AnalogChannel("P", 0),)), clock())),
+        ("zero-scale", Scene(quirky(format=Format(0), phasors=(PhasorChannel("V", 100),)), clock())),
+        ("retransmissions", Scene(with_events(retransmits=3), clock())),
+        ("two-senders", Scene(with_events(senders=1), clock())),
+        ("reconnects", Scene(with_events(connects=1), clock())),
+        ("pauses", Scene(slots(np.append(np.arange(6000), np.arange(6030, COUNT))), clock())),
+        ("periodic-delay", Scene(stream(delay_ms=44 + 0.3 * np.sin(np.arange(COUNT) * 2 * np.pi / 30)), clock())),
     ],
 )
 def test_not_made_of_what_is_only_near(case: str, near: Scene) -> None:

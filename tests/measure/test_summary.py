@@ -183,9 +183,11 @@ def test_mistakes_are_explained(text: str, remedy: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_scope_of_no_stream_is_a_mistake() -> None:
-    with pytest.raises(SettingsError, match="concerns no stream; did you mean 'N1'"):
-        verdicts(parse_requirements("N11.loss<=1%"), told())
+def test_a_limit_that_concerns_no_stream_does_not_hold() -> None:
+    (verdict,) = verdicts(parse_requirements("N11.loss<=1%"), told())
+    assert not verdict.holds
+    assert str(verdict) == "FAIL N11: N11.loss<=1% (no such stream; did you mean 'N1'?)"
+    assert not verdicts(parse_requirements("loss<=1%"), summary([], ClockLog()))[0].holds
 
 
 def test_two_runs_compared() -> None:

@@ -1,0 +1,84 @@
+"""What a diagnosis looks at, and what one row of the table of diagnoses is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from pmutools.measure.clockquality import ClockLog
+from pmutools.measure.histogram import NS_PER_MS
+from pmutools.measure.stream import StreamResult
+from pmutools.timebase import NS
+
+ENOUGH = 50
+"""Fewer frames with an arrival tell nothing of delays."""
+
+
+class Peer(NamedTuple):
+    """What is asked of another stream: its rate, frames/s, and its median delay, None of too few frames."""
+
+    rate: float
+    middle_ns: float | None
+
+
+def peer_of(result: StreamResult) -> Peer:
+    """A stream as the others see it."""
+    return Peer(float(result.rate), _middle(result))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a diagnosis may look at."""
+
+    result: StreamResult
+    clock: ClockLog = field(default_factory=ClockLog)
+    others: Sequence[Peer] = ()
+    """All streams of the run, this one among them."""
+
+    @property
+    def middle_ns(self) -> float | None:
+        """Median delay, of enough frames."""
+        return _middle(self.result)
+
+    @property
+    def locked_share(self) -> float:
+        delays = self.result.counts.delays
+        return delays.locked.count / delays.delay.count if delays.delay.count else 0.0
+
+
+Test = Callable[[Scene], str | None]
+
+
+class Diagnosis(NamedTuple):
+    """A finding: the row's id and its sentence."""
+
+    id: str
+    text: str
+
+
+class Row(NamedTuple):
+    """A symptom: what it is called, what it looks at, and the test that says it in words or returns None."""
+
+    id: str
+    sign: str
+    test: Test
+
+
+def _middle(result: StreamResult) -> float | None:
+    delays = result.counts.delays.delay
+    return delays.quantile_ns(0.5) if delays.count >= ENOUGH else None
+
+
+def ms_text(value_ns: float, sign: str = "") -> str:
+    """A duration in ms."""
+    return f"{value_ns / NS_PER_MS:{sign}.4g} ms"
+
+
+def span_text(value_ns: float) -> str:
+    """A long duration in the largest unit that there are two of."""
+    seconds = value_ns / NS
+    for unit, size in (("days", 86_400), ("hours", 3600), ("minutes", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.1f} s"
