@@ -30,7 +30,7 @@ def command(
 
     from pmutools.c37118.demux import Loss
     from pmutools.cli.dump_text import one_line
-    from pmutools.tools.describe import describe
+    from pmutools.formats.describe import describe
 
     talk, live = Talk(quiet, verbose), is_live(target)
     skipped = frames = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pmutools.tools.describe import Json
+from pmutools.formats.describe import Json
 
 
 def one_line(described: Json) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.formats import UNSAID, Nominal
-from pmutools.formats.files import OutputFile
+from pmutools.formats.output import OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource
 from pmutools.formats.table import arrow_source, reading

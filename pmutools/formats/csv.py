@@ -23,7 +23,8 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.errors import SourceError
 from pmutools.formats import UNSAID, Nominal, ieee_csv
 from pmutools.formats.columns import FrameValues, unique
-from pmutools.formats.files import OutputFile, TextTable, without_blank_end
+from pmutools.formats.files import TextTable, without_blank_end
+from pmutools.formats.output import OutputFile
 from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource

@@ -1,17 +1,13 @@
-"""Files as bytes and as rows of text, through gzip or zstd; every failure is a SourceError that names the file."""
+"""Files read as bytes and as rows of text, through gzip or zstd; a failure is a SourceError that names the file."""
 
 from __future__ import annotations
 
 import csv
-import gzip
 import io
-import os
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,102 +17,11 @@ from pmutools.errors import SourceError
 from pmutools.formats.capture.window import Window
 from pmutools.timebase import NS, parse_utc
 
-STDOUT = Path("-")
 TEXT_ROWS = 8192
 """Rows of a text file held at one time."""
 END_NS = NS << 32
 """SOC ends here, in 2106."""
 _NAN = float("nan")
-
-
-class OutputFile(io.RawIOBase):
-    """A file being written, compressed where its name ends in ``.gz`` or ``.zst``; ``-`` is standard output.
-
-    The same content gives the same bytes. What was flushed can be read, whatever happens to the process.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path = path
-        self._moves_to: Path | None = None
-        self._at = 0
-        with self._failing():
-            self._raw: IO[bytes] = sys.stdout.buffer if path == STDOUT else path.open("wb")
-            self._out = _compressed(self._raw, path.suffix.lower())
-
-    @property
-    def final_path(self) -> Path:
-        """Where the file is once it is closed."""
-        return self._moves_to or self.path
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        with self._failing():
-            self._out.write(data)
-        size = memoryview(data).nbytes
-        self._at += size
-        return size
-
-    def tell(self) -> int:
-        return self._at
-
-    def flush(self) -> None:
-        if self.closed:
-            return
-        with self._failing():
-            if self._out is not self._raw:
-                self._out.flush()
-            self._raw.flush()
-
-    def close(self) -> None:
-        if self.closed:
-            return
-        try:
-            super().close()  # which flushes
-        finally:
-            with self._failing():
-                try:
-                    if self._out is not self._raw:
-                        self._out.close()
-                finally:
-                    if self.path != STDOUT:
-                        self._raw.close()
-                if self._moves_to is not None:
-                    os.replace(self.path, self._moves_to)
-                    self.path = self._moves_to
-
-    def move(self, path: Path) -> None:
-        """Give the file, which goes on being written, another name; where the system refuses that, at the end."""
-        with self._failing():
-            try:
-                os.replace(self.path, path)
-                self.path = path
-            except PermissionError:  # Windows, while the file is open
-                self._moves_to = path
-
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            if self.path == STDOUT and isinstance(error, BrokenPipeError):  # its reader has seen enough
-                raise
-            raise SourceError(
-                f"cannot write {self.path}: {error.strerror or error}; check the folder and the space left"
-            ) from None
-
-
-def _compressed(raw: IO[bytes], suffix: str) -> Any:
-    match suffix:
-        case ".gz":
-            return gzip.GzipFile(filename="", mode="wb", fileobj=raw, compresslevel=6, mtime=0)
-        case ".zst":
-            import zstandard
-
-            return zstandard.ZstdCompressor().stream_writer(raw, closefd=False)
-    return raw
 
 
 class WindowFile(io.RawIOBase):

@@ -9,7 +9,7 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
 from pmutools.flow import Chunk, Flow
 from pmutools.formats.capture.window import Window
-from pmutools.formats.files import OutputFile
+from pmutools.formats.output import OutputFile
 from pmutools.formats.sink import FrameSink, SinkOptions
 from pmutools.formats.source import ByteSource
 

@@ -12,7 +12,7 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
 from pmutools.errors import SourceError
 from pmutools.flow import Flow
-from pmutools.formats.files import STDOUT, OutputFile
+from pmutools.formats.output import STDOUT, OutputFile
 from pmutools.formats.sink import SinkOptions, Wants
 from pmutools.formats.source import Block
 from pmutools.formats.table import long_rows, long_schema, wide_rows, wide_schema

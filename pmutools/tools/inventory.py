@@ -13,13 +13,10 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, FrameType, Stat
 from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
+from pmutools.formats.describe import describe_station
 from pmutools.formats.source import Block, Source
-from pmutools.measure.columns import frames_of, gist_of
-from pmutools.measure.slotmeter import SlotMeter
-from pmutools.measure.slots import HORIZON_S, SlotCounts
-from pmutools.tools.describe import describe_station
-
-HORIZON_NS = round(HORIZON_S * timebase.NS)
+from pmutools.measure.slots import OFF_GRID_SHARE
+from pmutools.tools.slots import SlotCounts
 
 
 @dataclass

@@ -46,7 +46,7 @@ from pmutools.c37118.frames import wire_values
 from pmutools.c37118.prefix import Prefix
 from pmutools.errors import ChecksumError, ConfigError, EncodeError, LengthError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
-from pmutools.tools.describe import describe
+from pmutools.formats.describe import describe
 
 FLOW = Flow("file", "test")
 ANNEX_D_DATA = bytes.fromhex(

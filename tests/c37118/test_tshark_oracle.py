@@ -33,7 +33,7 @@ from pmutools.c37118.demux import Demux
 from pmutools.cli import pmu
 from pmutools.cli.shell import run
 from pmutools.flow import Chunk, Flow
-from pmutools.tools.describe import describe
+from pmutools.formats.describe import describe
 
 pytestmark = pytest.mark.peer
 FIRST_PORT = 20000

@@ -20,8 +20,8 @@ from pmutools.c37118 import Message
 from pmutools.c37118.session import served
 from pmutools.errors import PmuError, SettingsError, SourceError
 from pmutools.formats import open_source
+from pmutools.formats.describe import describe
 from pmutools.formats.source import gather
-from pmutools.tools.describe import describe
 
 OPTIONS: dict[str, Any] = {"time_base": 1_000_000, "data_rate": 50, "idcode": 7}
 

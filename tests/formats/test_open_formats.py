@@ -185,7 +185,7 @@ def test_parquet_row_groups_are_bounded(tmp_path: Path) -> None:
     from pyarrow import parquet
 
     from pmutools.c37118.batch import decode_batch
-    from pmutools.formats.files import OutputFile
+    from pmutools.formats.output import OutputFile
     from pmutools.formats.table import wide_rows
 
     config = decode_config(STREAM.config())[1]

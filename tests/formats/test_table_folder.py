@@ -67,7 +67,7 @@ def test_where_open_files_cannot_be_moved_it_happens_at_the_end(
 
     one, two = stream(7), stream(8)
     with open_sink(tmp_path / "out.csv") as sink, monkeypatch.context() as windows:
-        windows.setattr("pmutools.formats.files.os.replace", refuse)
+        windows.setattr("pmutools.formats.output.os.replace", refuse)
         for block in gather([*one[:5], *two, *one[5:]]):
             sink.write(block)  # type: ignore[arg-type]
         assert (tmp_path / "out.csv").exists()

@@ -19,8 +19,8 @@ from support.peers import pyc37_stream, run_pyc37_pdc
 from pmutools.c37118.demux import Message
 from pmutools.c37118.framer import Frame
 from pmutools.formats import open_source
+from pmutools.formats.describe import describe
 from pmutools.net.endpoint import parse_endpoint
-from pmutools.tools.describe import describe
 from pmutools.tools.player.cast import as_recorded
 from pmutools.tools.player.play import Options, Player
 from pmutools.tools.player.reel import at_interval, record

@@ -16,8 +16,8 @@ from pmutools.c37118.config import decode_config
 from pmutools.c37118.demux import Message
 from pmutools.clock import SystemClock
 from pmutools.formats import open_sink, open_source
+from pmutools.formats.describe import describe
 from pmutools.timebase import NS
-from pmutools.tools.describe import describe
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader import read
 

@@ -31,10 +31,10 @@ from support.tshark import Masked, differences, dissect
 from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
 from pmutools.clock import SystemClock
 from pmutools.flow import StampSource
+from pmutools.formats.describe import describe
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.parsers import parse_place
 from pmutools.timebase import NS
-from pmutools.tools.describe import describe
 from pmutools.tools.live import LiveSource
 from pmutools.tools.player.cast import Cast
 from pmutools.tools.player.ledger import LedgerWriter

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import gzip
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Protocol
+from typing import Protocol
 
 from pmutools.errors import EncodeError, SourceError
 from pmutools.flow import Chunk, Flow
 from pmutools.formats.capture import link, pcapng
 from pmutools.formats.capture.build import Endpoint, Route, parse_endpoint
 from pmutools.formats.capture.tcp import ACK, SYN
+from pmutools.formats.output import OutputFile
 from pmutools.timebase import NS
 
 SEGMENT_BYTES = 1400
@@ -45,17 +45,13 @@ class CaptureWriter:
     bytes (IPv6: 65527) in a datagram, an arrival that the stamp cannot hold.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, suffix: str | None = None) -> None:
+        """``suffix`` says the kind where the name does not, as that of standard output (``-``)."""
         self.path = Path(path)
-        self._container = _container(self.path)
+        self._container = _container(self.path if suffix is None else Path(suffix))
         self._packetizer = _Packetizer()
-        self._file: _Output
-        try:
-            self._raw = self.path.open("wb")
-            self._file = _compressed(self._raw, self.path.suffix.lower())
-            self._file.write(self._container.header)
-        except OSError as error:
-            raise self._failure(error) from error
+        self._file = OutputFile(self.path)
+        self._file.write(self._container.header)
 
     def __enter__(self) -> CaptureWriter:
         return self
@@ -69,48 +65,15 @@ class CaptureWriter:
         """Append the packets of ``chunk``. One without an arrival: in pcapng without a stamp, in pcap stamped as the
         packet before it (the first: 1970)."""
         packets = self._packetizer.packets(chunk)
-        records = [self._container.record(chunk.arrival_ns, packet) for packet in packets]
-        try:
-            self._file.write(b"".join(records))
-        except OSError as error:
-            raise self._failure(error) from error
+        self._file.write(b"".join([self._container.record(chunk.arrival_ns, packet) for packet in packets]))
 
     def flush(self) -> None:
         """Put all that was written into the file, readable to its end."""
-        try:
-            self._file.flush()
-            self._raw.flush()
-        except OSError as error:
-            raise self._failure(error) from error
+        self._file.flush()
 
     def close(self) -> None:
         """Finish the file; may be called again."""
-        try:
-            if self._file is not self._raw:
-                self._file.close()
-            self._raw.close()
-        except OSError as error:
-            raise self._failure(error) from error
-
-    def _failure(self, error: OSError) -> SourceError:
-        return SourceError(f"cannot write {self.path}: {error.strerror}; check the folder and the space left")
-
-
-class _Output(Protocol):
-    def write(self, data: bytes, /) -> int: ...
-    def flush(self) -> object: ...
-    def close(self) -> object: ...
-
-
-def _compressed(raw: BinaryIO, suffix: str) -> _Output:
-    match suffix:
-        case ".gz":
-            return gzip.GzipFile(filename="", mode="wb", fileobj=raw, compresslevel=6, mtime=0)
-        case ".zst":
-            import zstandard
-
-            return zstandard.ZstdCompressor().stream_writer(raw, closefd=False)
-    return raw
+        self._file.close()
 
 
 class _Container(Protocol):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.formats.files import OutputFile
+from pmutools.formats.output import OutputFile
 from pmutools.impair.outgoing import LedgerRow
 from pmutools.tools.player.reel import I64
 from pmutools.tools.player.sheet import EMPTY, FATES, SENT, Sheet
