@@ -9,11 +9,11 @@ from typing import Any
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.formats import UNSAID, Nominal
-from pmutools.formats.output import OutputFile
+from pmutools.formats.output import STDOUT, OutputFile
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource
 from pmutools.formats.table import arrow_source, reading
-from pmutools.formats.table_sink import TableSink
+from pmutools.formats.table_sink import TableSink, TableWriter
 
 MAGIC = b"ARROW1"
 _FRAME = 8
@@ -22,9 +22,15 @@ _FRAME = 8
 
 def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a table, one record batch in memory at a time."""
+    return read_rows(path, "arrow", configs, nominal, Counter())
+
+
+def read_rows(
+    path: Path, kind: str, configs: Iterable[StreamConfig], nominal: Nominal, defects: Counter[str]
+) -> TableSource:
+    """:func:`read`, of a file that stands for another of another ``kind``."""
     import pyarrow as pa
 
-    defects = Counter[str]()
     with reading(path, "Arrow"):
         file = pa.OSFile(str(path))
         file.seek(_FRAME if file.read(len(MAGIC)) == MAGIC else 0)
@@ -37,22 +43,19 @@ def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UN
                 except (OSError, ValueError, pa.ArrowException):
                     defects["table without an end"] = 1
 
-        return arrow_source(path, "arrow", stream.schema, parts(), configs, defects, nominal)
+        return arrow_source(path, kind, stream.schema, parts(), configs, defects, nominal)
 
 
-class ArrowRows:
-    """Writes each record batch at once."""
+class ArrowRows(TableWriter):
+    """Writes each record batch at once: an IPC file, or a stream where it goes to standard output."""
 
-    def __init__(self, file: OutputFile, schema: Any) -> None:
+    def __init__(self, file: OutputFile, schema: Any, options: SinkOptions) -> None:
         import pyarrow as pa
 
-        self._file: Any = pa.ipc.new_file(file, schema)
+        self._file: Any = (pa.ipc.new_stream if file.path == STDOUT else pa.ipc.new_file)(file, schema)
 
     def write(self, rows: Any) -> None:
         self._file.write_batch(rows)
-
-    def flush(self) -> None:
-        """Nothing is held back here."""
 
     def close(self) -> None:
         self._file.close()

@@ -14,7 +14,7 @@ values and put back there, so they keep what a complex number cannot: an angle b
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -95,8 +95,8 @@ def _station_columns(title: str, station: Station, phasors: Phasors) -> Iterable
 # --- batch -> columns -------------------------------------------------------------------------------------------
 
 
-def quantities(batch: Batch, phasors: Phasors) -> dict[str, npt.NDArray[Any]]:
-    """The values of ``batch`` by quantity, each (N, places); angles in degrees."""
+def quantities(batch: Batch, phasors: Phasors, wanted: Collection[str]) -> dict[str, npt.NDArray[Any]]:
+    """The values of ``batch`` by quantity, each (N, places), at least those ``wanted``; angles in degrees."""
     values: dict[str, npt.NDArray[Any]] = {
         "stat": batch.stat,
         "freq_hz": batch.frequency,
@@ -106,10 +106,20 @@ def quantities(batch: Batch, phasors: Phasors) -> dict[str, npt.NDArray[Any]]:
     }
     if phasors == "rect":
         return values | {"re": batch.phasors.real, "im": batch.phasors.imag}
-    magnitude, degrees = np.abs(batch.phasors), np.degrees(np.angle(batch.phasors))
+    if not {"mag", "deg"}.isdisjoint(wanted):
+        values["mag"], values["deg"] = _polar(batch)
+    return values
+
+
+def _polar(batch: Batch) -> tuple[Floats, Floats]:
+    """Magnitudes and angles (N, P)."""
+    if batch.wire is not None and all(station.format & Format.POLAR for station in batch.config.stations):
+        magnitude, degrees = np.empty(batch.phasors.shape), np.empty(batch.phasors.shape)
+    else:
+        magnitude, degrees = np.abs(batch.phasors), np.degrees(np.angle(batch.phasors))
     if batch.wire is not None:
         _read_polar(batch.wire, batch.config, magnitude, degrees)
-    return values | {"mag": magnitude, "deg": degrees}
+    return magnitude, degrees
 
 
 def _polar_stations(config: StreamConfig) -> Iterable[tuple[str, slice, Floats, Floats]]:

@@ -28,8 +28,8 @@ from pmutools.formats.output import OutputFile
 from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
 from pmutools.formats.sink import SinkOptions
 from pmutools.formats.source import TableSource
-from pmutools.formats.table import LONG_COLUMNS
-from pmutools.formats.table_sink import TableSink
+from pmutools.formats.table_rows import LONG_COLUMNS
+from pmutools.formats.table_sink import TableSink, TableWriter
 
 TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 
@@ -83,46 +83,49 @@ def _block(
     return Rows(frames, idcodes_of(values("idcode"), count), values)
 
 
-class CsvRows:
+class CsvRows(TableWriter):
     """Writes each record batch at once, its header before the first."""
 
-    def __init__(self, file: OutputFile, schema: Any) -> None:
+    def __init__(self, file: OutputFile, schema: Any, options: SinkOptions) -> None:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
-        fields = [pa.field("time", pa.string()), *list(schema)[1:]]
-        self._schema = pa.schema([pa.field(f.name, _plain(f.type)) for f in fields])
+        self._schema = pa.schema([_plain(field) for field in schema])
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(self._schema.names)
         file.write(header.getvalue().encode())
         quoting = "needed" if "station" in self._schema.names else "none"  # names may hold commas
-        options = arrow_csv.WriteOptions(include_header=False, quoting_style=quoting)
-        self._file: Any = arrow_csv.CSVWriter(file, self._schema, write_options=options)
+        settings = arrow_csv.WriteOptions(include_header=False, quoting_style=quoting)
+        self._file: Any = arrow_csv.CSVWriter(file, self._schema, write_options=settings)
 
     def write(self, rows: Any) -> None:
         import pyarrow as pa
-        import pyarrow.compute as pc
 
-        def plain(column: Any) -> Any:
-            if pa.types.is_floating(column.type):
-                return pc.if_else(pc.is_nan(column), pa.scalar(None, column.type), column)
-            return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
-
-        time, *others = rows.columns
-        stamps = pc.strftime(time.cast(pa.timestamp("ns")), TIME_FORMAT)
-        self._file.write_batch(pa.RecordBatch.from_arrays([stamps, *map(plain, others)], schema=self._schema))
-
-    def flush(self) -> None:
-        """Nothing is held back here."""
+        columns = [_cells(name, column) for name, column in zip(rows.schema.names, rows.columns, strict=True)]
+        self._file.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
 
     def close(self) -> None:
         self._file.close()
 
 
-def _plain(kind: Any) -> Any:
+def _cells(name: str, column: Any) -> Any:
+    """A column as it is printed: ISO-8601, texts, nothing for NaN."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if name == "time_ns":
+        return pc.strftime(column.cast(pa.timestamp("ns")), TIME_FORMAT)
+    if pa.types.is_floating(column.type):
+        return pc.if_else(pc.is_nan(column), pa.scalar(None, column.type), column)
+    return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+
+
+def _plain(field: Any) -> Any:
     import pyarrow as pa
 
-    return pa.string() if pa.types.is_dictionary(kind) else kind
+    if field.name == "time_ns":
+        return pa.field("time", pa.string())
+    return pa.field(field.name, pa.string() if pa.types.is_dictionary(field.type) else field.type)
 
 
 def create(path: Path, options: SinkOptions) -> TableSink:

@@ -8,6 +8,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, Self
 
 from pmutools.c37118.demux import Message
+from pmutools.formats.fields import Fields
+from pmutools.formats.naming import Namer, stream_name
 
 if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
@@ -18,10 +20,25 @@ Wants = Literal["messages", "blocks"]
 
 
 class SinkOptions(NamedTuple):
-    """How tables are written: phasors as magnitude and angle or as two parts; one row a frame or (``long``) a value."""
+    """How a recording is written; ``phasors``, ``long`` and ``fields`` concern tables."""
 
     phasors: Literal["polar", "rect"] = "polar"
+    """As magnitude and angle, or as two parts."""
     long: bool = False
+    """One row a value of any stream, not a frame of one."""
+    fields: Fields | None = None
+    """The columns wanted; None: all."""
+    per_stream: bool = False
+    """One file a stream in a folder, from the first stream on."""
+    name: Namer = stream_name
+    """What a stream's file is called there."""
+    journal: bool = False
+    """Readable up to the last flush before it is finished, also where the format is not by itself."""
+    suffix: str = ""
+    """The suffix of what goes to standard output."""
+
+
+PLAIN = SinkOptions()
 
 
 class Sink(Protocol):

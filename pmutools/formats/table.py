@@ -1,4 +1,4 @@
-"""Tables of measurements as Arrow data: what CSV, Parquet and Arrow files share, both ways.
+"""Tables of measurements as Arrow data: what CSV, Parquet and Arrow files share. Read here; written: ``table_rows``.
 
 A wide table has one row a data frame and is of one stream; its columns are those of :mod:`pmutools.formats.columns`,
 its metadata hold the configuration frame (in hex, because Parquet metadata are text), so that it plays back. Long form
@@ -19,110 +19,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch
-from pmutools.c37118.config import StreamConfig, decode_config, encode_config
+from pmutools.c37118.batch import NO_TIME
+from pmutools.c37118.config import StreamConfig, decode_config
 from pmutools.errors import PmuError, SourceError, WireError
 from pmutools.formats import UNSAID, Nominal
-from pmutools.formats.columns import INTEGERS, FrameValues, Phasors, columns_of, quantities
+from pmutools.formats.columns import FrameValues
 from pmutools.formats.files import END_NS
 from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
 from pmutools.formats.source import BLOCK_FRAMES, TableSource
-
-CONFIG_KEY = b"c37118.config"
-"""Schema metadata: the configuration frame, in hex."""
-PHASORS_KEY = b"c37118.phasors"
-LONG_COLUMNS = ("station", "channel", "quantity", "value")
-
-# pyarrow has no types: its schemas, arrays and batches are Any here.
-
-
-# --- writing ----------------------------------------------------------------------------------------------------
-
-
-def _frame_fields() -> list[Any]:
-    import pyarrow as pa
-
-    return [
-        pa.field("time_ns", pa.int64(), nullable=False),
-        pa.field("arrival_ns", pa.int64()),
-        pa.field("stamp_source", pa.dictionary(pa.int8(), pa.string())),
-        pa.field("idcode", pa.uint16(), nullable=False),
-        pa.field("time_quality", pa.uint8(), nullable=False),
-    ]
-
-
-@lru_cache(maxsize=1024)
-def wide_schema(config: StreamConfig, phasors: Phasors) -> Any:
-    """Arrow schema of one stream's table; each field's metadata name its unit."""
-    import pyarrow as pa
-
-    fields = _frame_fields()
-    for column in columns_of(config, phasors):
-        kind = pa.uint16() if column.quantity in INTEGERS else pa.float64()
-        fields.append(pa.field(column.name, kind, metadata={"unit": column.unit} if column.unit else None))
-    return pa.schema(fields, {CONFIG_KEY: encode_config(config).hex(), PHASORS_KEY: phasors})
-
-
-@lru_cache(maxsize=1)
-def long_schema() -> Any:
-    """Arrow schema of a table in long form: ``quantity`` is stat, freq_hz, mag and so on."""
-    import pyarrow as pa
-
-    return pa.schema([*_frame_fields(), *((name, pa.string()) for name in LONG_COLUMNS[:-1]), ("value", pa.float64())])
-
-
-def wide_rows(batch: Batch, phasors: Phasors) -> Any:
-    """``batch`` as an Arrow record batch of :func:`wide_schema`."""
-    import pyarrow as pa
-
-    values = quantities(batch, phasors)
-    columns = [
-        pa.array(np.ascontiguousarray(values[column.quantity][:, column.at]))
-        for column in columns_of(batch.config, phasors)
-    ]
-    return pa.RecordBatch.from_arrays([*_frame_arrays(batch, 1), *columns], schema=wide_schema(batch.config, phasors))
-
-
-def long_rows(batch: Batch, phasors: Phasors) -> Any:
-    """``batch`` as an Arrow record batch of :func:`long_schema`, frame after frame."""
-    import pyarrow as pa
-
-    columns, values = columns_of(batch.config, phasors), quantities(batch, phasors)
-    flat = np.stack([values[column.quantity][:, column.at].astype(np.float64) for column in columns], axis=1)
-    codes = np.tile(np.arange(len(columns), dtype=np.int32), len(batch))
-    names = [
-        pa.DictionaryArray.from_arrays(codes, [value or None for value in named]).dictionary_decode()
-        for named in zip(*((column.station, column.channel, column.quantity) for column in columns), strict=True)
-    ]
-    arrays = [*_frame_arrays(batch, len(columns)), *names, pa.array(flat.reshape(-1))]
-    return pa.RecordBatch.from_arrays(arrays, schema=long_schema())
-
-
-def _frame_arrays(batch: Batch, times: int) -> list[Any]:
-    """The frame columns, each row ``times`` times."""
-    import pyarrow as pa
-
-    def repeated(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return np.repeat(values, times)
-
-    arrival = repeated(batch.arrival_ns)
-    return [
-        pa.array(repeated(batch.time_ns)),
-        pa.array(arrival, mask=arrival == NO_TIME),
-        pa.DictionaryArray.from_arrays(repeated(batch.stamp_source).astype(np.int8), list(map(str, STAMP_SOURCES))),
-        pa.array(np.full(len(arrival), batch.config.idcode, np.uint16)),
-        pa.array(repeated(batch.time_quality)),
-    ]
-
-
-# --- reading ----------------------------------------------------------------------------------------------------
+from pmutools.formats.table_rows import CONFIG_KEY, LONG_COLUMNS
 
 
 @contextmanager

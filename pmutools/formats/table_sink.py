@@ -2,31 +2,56 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Self
 
+from pmutools.c37118.batch import Batch
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
 from pmutools.errors import SourceError
 from pmutools.flow import Flow
+from pmutools.formats.naming import FileNames, folder_for
 from pmutools.formats.output import STDOUT, OutputFile
 from pmutools.formats.sink import SinkOptions, Wants
-from pmutools.formats.source import Block
-from pmutools.formats.table import long_rows, long_schema, wide_rows, wide_schema
+from pmutools.formats.source import BLOCK_FRAMES, Block
+from pmutools.formats.table_rows import LongRows, has_columns, wide_rows, wide_schema
 
-_Key = tuple[Flow, StreamConfig] | None
-"""What tells one table from another; None for the one table in long form."""
+HELD_BYTES = 256 << 20
+"""What all tables together hold in memory between two flushes, before it is written though it makes small groups."""
 
 
-class TableWriter(Protocol):
+class TableWriter:
     """Writes Arrow record batches of one schema into an open file, which it does not close."""
 
-    def write(self, rows: Any) -> None: ...
-    def flush(self) -> None: ...
-    def close(self) -> None: ...
+    packed = False
+    """Whether names may come dictionary-encoded, by dictionaries that grow."""
+    held_bytes = 0
+    """What is in memory only."""
+
+    def __init__(self, file: OutputFile, schema: Any, options: SinkOptions) -> None:
+        raise NotImplementedError
+
+    def write(self, rows: Any) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def flush(self) -> None:
+        """Make readable what the file itself does not; it is flushed by then."""
+
+    def spill(self) -> None:
+        """Write what is held in memory."""
+
+    def moved(self) -> None:
+        """The file has another name now."""
+
+
+class _Table(NamedTuple):
+    file: OutputFile
+    writer: TableWriter
 
 
 class TableSink:
@@ -34,58 +59,71 @@ class TableSink:
 
     The first stream is written to ``path``. When a second one appears (another flow, IDCODE or configuration), a folder
     is made, named as ``path`` without its suffix (``-2``, ``-3`` ... after it where that holds something already), and
-    the tables lie in it as STATION-IDCODE with the suffix. Connections between the same two endpoints are one stream.
+    the tables lie in it as STATION-IDCODE with the suffix; with ``per_stream`` from the first on. Connections between
+    the same two endpoints are one stream. A stream that has none of the fields wanted is left out.
     """
 
     wants: Wants = "blocks"
 
-    def __init__(
-        self, path: Path, suffix: str, writer: Callable[[OutputFile, Any], TableWriter], options: SinkOptions
-    ) -> None:
-        self._path, self._suffix, self._writer, self._options = path, suffix, writer, options
-        self._files = [OutputFile(path)]
-        self._writers: dict[_Key, TableWriter] = {}
-        self._first_config: StreamConfig | None = None
-        self._folder: Path | None = None
+    def __init__(self, path: Path, suffix: str, writer: type[TableWriter], options: SinkOptions) -> None:
+        self._path, self._writer, self._options = path, writer, options
+        self._names = FileNames(suffix)
+        self._tables: list[_Table] = []
+        self._by_stream: dict[tuple[Flow, StreamConfig], TableWriter] = {}
+        self._first_name = ""
+        self._folder = folder_for(path, suffix) if options.per_stream else None
+        self._first_file = OutputFile(path) if self._folder is None else None
+        self._long = LongRows(options.phasors, options.fields, packed=writer.packed) if options.long else None
+        self._gathered: list[Batch] = []
+        self._gathered_frames = 0
         self._closed = False
 
     @property
     def paths(self) -> list[Path]:
-        return [file.final_path for file in self._files] if self._writers else []
+        return [table.file.final_path for table in self._tables]
 
     def write(self, item: Message | Block) -> None:
         if isinstance(item, Message) or not len(item.batch):
             return
         flow, batch = item
-        phasors, config = self._options.phasors, batch.config
-        if self._options.long:
-            key, to_rows = None, long_rows
-        else:
-            key, to_rows = (flow._replace(connection=0), config), wide_rows
-        writer = self._writers.get(key)
+        options = self._options
+        if options.fields is not None and not has_columns(batch.config, options.phasors, options.fields):
+            return
+        if self._long is not None:
+            self._gathered.append(batch)
+            self._gathered_frames += len(batch)
+            if self._gathered_frames >= BLOCK_FRAMES:
+                self._write_gathered()
+            return
+        key = flow._replace(connection=0), batch.config
+        writer = self._by_stream.get(key)
         if writer is None:
-            schema = long_schema() if self._options.long else wide_schema(config, phasors)
-            writer = self._writers[key] = self._writer(self._next_file(config), schema)
-        writer.write(to_rows(batch, phasors))
+            schema = wide_schema(batch.config, options.phasors, options.fields)
+            writer = self._by_stream[key] = self._begin(self._next_file(flow, batch.config), schema)
+        writer.write(wide_rows(batch, options.phasors, options.fields))
 
     def flush(self) -> None:
-        for writer, file in zip(self._writers.values(), self._files, strict=False):
-            writer.flush()
+        self._write_gathered()
+        if sum(table.writer.held_bytes for table in self._tables) > HELD_BYTES:
+            for table in self._tables:
+                table.writer.spill()
+        for file, writer in self._tables:
             file.flush()
+            writer.flush()
 
     def close(self) -> None:
-        """Finish all tables; where there are none, the file that was opened for the first is taken away."""
+        """Finish all tables; where there are none, the file or folder that was made for the first is taken away."""
         if self._closed:
             return
         self._closed = True
         failures: list[SourceError] = []
-        for close in [writer.close for writer in self._writers.values()] + [file.close for file in self._files]:
+        for step in self._last_steps():
             try:
-                close()
+                step()
             except SourceError as error:
                 failures.append(error)
-        if not self._writers and self._path != STDOUT and self._path.is_file():
-            self._path.unlink()
+        if not self._tables:
+            self._take_away()
         if failures:
             raise failures[0]
 
@@ -97,42 +135,44 @@ class TableSink:
     ) -> None:
         self.close()
 
-    def _next_file(self, config: StreamConfig) -> OutputFile:
+    def _last_steps(self) -> Iterator[Callable[[], None]]:
+        yield self._write_gathered
+        yield from (table.writer.close for table in self._tables)
+        yield from (table.file.close for table in self._tables)
+
+    def _write_gathered(self) -> None:
+        batches, self._gathered, self._gathered_frames = self._gathered, [], 0
+        if not batches or self._long is None:
+            return
+        if not self._tables:
+            assert self._first_file is not None
+            self._begin(self._first_file, self._long.schema)
+        self._tables[0].writer.write(self._long.rows(batches))
+
+    def _begin(self, file: OutputFile, schema: Any) -> TableWriter:
+        table = _Table(file, self._writer(file, schema, self._options))
+        self._tables.append(table)
+        return table.writer
+
+    def _next_file(self, flow: Flow, config: StreamConfig) -> OutputFile:
         """The file of a new table: OUT for the first; with the second, OUT moves into the folder."""
-        if self._first_config is None:
-            self._first_config = config
-            return self._files[0]
+        name = self._names.unique(self._options.name(flow, config))
+        if not self._tables and self._first_file is not None:
+            self._first_name = name
+            return self._first_file
         if self._path == STDOUT:
             raise SourceError("several streams cannot share standard output as tables; name a file, or use --long")
         if self._folder is None:
-            self._folder = _new_folder(self._path.with_name(self._path.name[: -len(self._suffix)]))
-            self._files[0].move(self._folder / self._file_name(self._first_config))
-        file = OutputFile(self._folder / self._file_name(config))
-        self._files.append(file)
-        return file
+            self._folder = folder_for(self._path, self._names.suffix)
+            first = self._tables[0]
+            first.file.move(self._folder / self._first_name)
+            first.writer.moved()
+        return OutputFile(self._folder / name)
 
-    def _file_name(self, config: StreamConfig) -> str:
-        station = config.stations[0].name if config.stations else ""
-        safe = re.sub(r"[^\w.+-]+", "_", station).strip("._") or "stream"
-        stem = f"{safe}-{config.idcode}"
-        taken = {file.final_path.name.casefold() for file in self._files}
-        name, count = stem + self._suffix, 1
-        while name.casefold() in taken:
-            count += 1
-            name = f"{stem}-{count}{self._suffix}"
-        return name
-
-
-def _new_folder(wanted: Path) -> Path:
-    """``wanted``, made; or ``wanted-2``, ``wanted-3`` ... where that is a file, or a folder that holds something."""
-    folder, count = wanted, 1
-    try:
-        while folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-            count += 1
-            folder = wanted.with_name(f"{wanted.name}-{count}")
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise SourceError(
-            f"cannot make the folder {folder}: {error.strerror}; check the place and its rights"
-        ) from None
-    return folder
+    def _take_away(self) -> None:
+        if self._first_file is not None:
+            self._first_file.close()
+            if self._path != STDOUT and self._path.is_file():
+                self._path.unlink()
+        elif self._folder is not None and not any(self._folder.iterdir()):
+            self._folder.rmdir()

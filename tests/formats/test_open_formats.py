@@ -19,7 +19,7 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Flow
 from pmutools.formats import FORMATS, open_sink, open_source
 from pmutools.formats.parquet import ROW_GROUP_ROWS, ParquetRows
-from pmutools.formats.table import wide_schema
+from pmutools.formats.table_rows import wide_schema
 
 STREAM = next(
     stream
@@ -186,7 +186,7 @@ def test_parquet_row_groups_are_bounded(tmp_path: Path) -> None:
 
     from pmutools.c37118.batch import decode_batch
     from pmutools.formats.output import OutputFile
-    from pmutools.formats.table import wide_rows
+    from pmutools.formats.table_rows import wide_rows
 
     config = decode_config(STREAM.config())[1]
     batch = decode_batch(STREAM.data[0] * 10_000, config)

@@ -27,7 +27,7 @@ def decoded(stream: Described, kind: str = "cfg2") -> Batch:
 
 
 def through_columns(batch: Batch, style: Phasors) -> Batch:
-    values, columns = quantities(batch, style), columns_of(batch.config, style)
+    values, columns = quantities(batch, style, {"mag", "deg"}), columns_of(batch.config, style)
     by_name = {column.name: values[column.quantity][:, column.at] for column in columns}
     frames = FrameValues(batch.time_ns, batch.arrival_ns, batch.stamp_source, batch.time_quality)
     return batch_of(batch.config, columns, frames, by_name.get, exact=True)
