@@ -354,7 +354,7 @@ class Demux:
 
     def _drop(self, state: _FlowState, frames: list[Frame], out: list[Message | Loss]) -> None:
         for frame in frames:
-            self._lose(state, Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data)), out)
+            self._lose(state, Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data), frame.idcode), out)
 
     def _join(self, state: _FlowState, frame: Frame) -> StreamConfig | None:
         """Collect CFG-3 fragments that each have their own CHK; the configuration once the last one is there.

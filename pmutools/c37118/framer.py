@@ -52,11 +52,15 @@ class Frame(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """A run of bytes that is no frame, with the first cause met in it."""
+    """A run of bytes that is no frame, with the first cause met in it.
+
+    ``idcode`` is what its bytes claim, where they begin as a frame does that is damaged or cannot be read.
+    """
 
     reason: SkipReason
     offset: int
     nbytes: int
+    idcode: int | None = None
 
 
 _TYPES = tuple(FrameType)
@@ -72,6 +76,11 @@ def _next_sync(buffer: bytes, at: int, end: int) -> int:
     """Where the next SYNC of a known type may begin; ``end`` if nowhere."""
     found = _SYNC.search(buffer, at, end)
     return found.start() if found else end
+
+
+def _claimed(buffer: bytes, at: int) -> int | None:
+    """The IDCODE of what begins like a frame at ``at``."""
+    return buffer[at + 4] << 8 | buffer[at + 5] if buffer[at] == _AA and at + 6 <= len(buffer) else None
 
 
 class Framer:
@@ -146,9 +155,9 @@ class Framer:
                 out.append(Frame(frame, arrival_ns, source, self._offset + at))
             elif reason is SkipReason.UNSUPPORTED:  # whole frames: each a record of its own
                 self._close_run(out)
-                out.append(Skipped(reason, self._offset + at, size))
+                out.append(Skipped(reason, self._offset + at, size, _claimed(buffer, at)))
             else:
-                self._skip(reason, self._offset + at, size)
+                self._skip(reason, buffer, at, size)
             at += size
         self._buffer = buffer[at:]
         self._offset += at
@@ -203,9 +212,12 @@ class Framer:
             self._searched[head] = self._offset + (found if found >= 0 else end - len(head) + 1)
         return first
 
-    def _skip(self, reason: SkipReason, offset: int, nbytes: int) -> None:
+    def _skip(self, reason: SkipReason, buffer: bytes, at: int, nbytes: int) -> None:
         run = self._open
-        self._open = Skipped(reason, offset, nbytes) if run is None else run._replace(nbytes=run.nbytes + nbytes)
+        if run is None:
+            self._open = Skipped(reason, self._offset + at, nbytes, _claimed(buffer, at))
+        else:
+            self._open = run._replace(nbytes=run.nbytes + nbytes)
 
     def _close_run(self, out: list[Frame | Skipped]) -> None:
         if self._open is not None:

@@ -17,6 +17,7 @@ COMMANDS = {
     "play": ("pmutools.cli.play", "Stream a recording live, as any number of PMUs."),
     "ctl": ("pmutools.cli.ctl", "Control a running player."),
     "read": ("pmutools.cli.read", "Read live streams and log them."),
+    "characterize": ("pmutools.cli.characterize", "How late, how even, how lossy streams come."),
     "clock": ("pmutools.cli.clock", "How good this machine's clock is, by all who can tell."),
 }
 
@@ -45,6 +46,11 @@ def player() -> None:
 def reader() -> None:
     """``stream-reader``: the paper's StreamReader, ``pmu read``."""
     sys.exit(_alone("read", "stream-reader"))
+
+
+def characterizer() -> None:
+    """``network-characterizer``: the paper's PMU Network Characterizer, ``pmu characterize``."""
+    sys.exit(_alone("characterize", "network-characterizer"))
 
 
 def _alone(subcommand: str, name: str) -> int:

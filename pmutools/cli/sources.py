@@ -77,7 +77,7 @@ def open_target(target: str, duration_ns: int | None, talk: Talk, verbose: int =
     from pmutools.formats import open_source
 
     source = open_source(target)
-    cut = source if duration_ns is None else _Cut(source, duration_ns)
+    cut = source if duration_ns is None else Cut(source, duration_ns)
     yield Opened(cut, lambda: f"no C37.118 frames found in {source.tally.fed} bytes of payload")
 
 
@@ -91,7 +91,7 @@ class _Through:
         return getattr(self.source, name)
 
 
-class _Cut(_Through):
+class Cut(_Through):
     """A source whose data frames end ``duration_ns`` after the first."""
 
     def __init__(self, source: Source, duration_ns: int) -> None:

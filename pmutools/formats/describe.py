@@ -29,7 +29,7 @@ def number(value: float) -> float | None:
 def describe(item: Message | Loss) -> Json:
     """One frame, or one run of skipped bytes, as a JSON object."""
     if isinstance(item, Loss):
-        reason, offset, nbytes = item.skipped
+        reason, offset, nbytes, _ = item.skipped
         return {"type": "skipped", "reason": str(reason), "offset": offset, "nbytes": nbytes, "flow": flow_name(item)}
     frame, _, config = item
     if frame.type is FrameType.DATA:

@@ -19,6 +19,8 @@ from pmutools.flow import Chunk, Flow, StampSource, Train
 from pmutools.timebase import from_ns
 
 BLOCK_FRAMES = 8192
+GATHERED_FRAMES = 1 << 17
+"""Of all streams together: what is held in memory."""
 
 
 class Block(NamedTuple):
@@ -164,7 +166,10 @@ class Gatherer:
 
     def __init__(self, frames: int = BLOCK_FRAMES) -> None:
         self.frames = frames
+        self.full = False
+        """Whether some stream has a whole block waiting, or all of them :data:`GATHERED_FRAMES`."""
         self._runs: dict[tuple[Flow, int], _Run] = {}
+        self._waiting = 0
 
     def add(self, message: Message) -> Block | None:
         """Take a data message; a block comes back when one was full or the stream's configuration changed."""
@@ -189,19 +194,26 @@ class Gatherer:
         """Where ``count`` more frames go, and what is complete without them."""
         key = (flow, config.idcode)
         run = self._runs.get(key)
+        self._waiting += count
         if (
             run is not None
             and len(run.arrivals) + count <= self.frames
             and (run.config is config or run.config == config)
         ):
+            self.full = len(run.arrivals) + count >= self.frames or self._waiting >= GATHERED_FRAMES
             return run, None
-        block = run.block(flow) if run is not None else None
+        block = None
+        if run is not None:
+            block = run.block(flow)
+            self._waiting -= len(run.arrivals)
         run = self._runs[key] = _Run(config)
+        self.full = count >= self.frames or self._waiting >= GATHERED_FRAMES
         return run, block
 
     def flush(self) -> Iterator[Block]:
         """All that is waiting."""
         runs, self._runs = self._runs, {}
+        self._waiting, self.full = 0, False
         for (flow, _), run in runs.items():
             yield run.block(flow)
 
@@ -209,7 +221,10 @@ class Gatherer:
 def gather(
     items: Iterable[Block | Message | Loss | DataRun], frames: int = BLOCK_FRAMES
 ) -> Iterator[Block | Message | Loss]:
-    """Data messages gathered into blocks of up to ``frames``; everything else passes through."""
+    """Data messages gathered into blocks of up to ``frames``; everything else passes through.
+
+    When one stream's block is whole, those of all others come too: so streams stay within a block of each other.
+    """
     gatherer = Gatherer(frames)
     data = FrameType.DATA
     for item in items:
@@ -222,4 +237,6 @@ def gather(
             continue
         if block is not None:
             yield block
+        if gatherer.full:
+            yield from gatherer.flush()
     yield from gatherer.flush()

@@ -9,7 +9,7 @@ its transmit stamps, a second capture) PMU and communication are told apart. Wha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pmutools.measure.histogram import NS_PER_MS, Histogram
 
@@ -49,24 +49,33 @@ class Row:
         }
 
 
+class Departures(NamedTuple):
+    """What a sender's record tells of delays."""
+
+    at_sender: Histogram
+    """Stamp to departure."""
+    one_way: Histogram
+    """Departure to arrival."""
+
+
 def budget(
     delay: Histogram,
     pdv: Histogram,
     to_tick: Histogram,
     *,
-    at_sender: Histogram | None = None,
+    departures: Departures | None = None,
     compute_ms: float = COMPUTE_MS,
     command_ms: float | None = None,
 ) -> tuple[Row, ...]:
     """The rows of a stream, the last one their sum; none where no delay was measured.
 
     ``delay`` is stamp-to-arrival, ``pdv`` above its floor, ``to_tick`` from arrival to the next control step (of
-    :class:`~pmutools.measure.windows.WindowCounts`), ``at_sender`` stamp to departure, ``command_ms`` the measured time
-    from command to actuator; the paper's stands in for it.
+    :class:`~pmutools.measure.windows.WindowCounts`), ``departures`` come from the sender. ``command_ms`` is the
+    measured time from command to actuator; the paper's stands in for it.
     """
     if not delay.count:
         return ()
-    rows = [*_to_arrival(delay, pdv, at_sender)]
+    rows = [*_to_arrival(delay, pdv, departures)]
     if to_tick.count:
         why = f"measured wait for the next control window, and {compute_ms:g} ms assumed for computing"
         mean, least, most = _ends(to_tick)
@@ -85,24 +94,17 @@ def budget(
     return (*rows, Row("Effective", mean, least, most, not assumed, how))
 
 
-def _to_arrival(delay: Histogram, pdv: Histogram, at_sender: Histogram | None) -> tuple[Row, Row]:
+def _to_arrival(delay: Histogram, pdv: Histogram, departures: Departures | None) -> tuple[Row, Row]:
     mean, least, most = _ends(delay)
-    if at_sender is not None and at_sender.count:
-        sent = _ends(at_sender)
+    if departures is not None and departures.at_sender.count and departures.one_way.count:
         return (
-            Row("PMU", *sent, True, "stamp to departure, seen at the sender"),
-            Row(
-                "Communication",
-                mean - sent[0],
-                max(0.0, least - sent[1]),
-                max(0.0, most - sent[1]),
-                True,
-                "arrival less departure",
-            ),
+            Row("PMU", *_ends(departures.at_sender), True, "stamp to departure, seen at the sender"),
+            Row("Communication", *_ends(departures.one_way), True, "departure to arrival, frame by frame"),
         )
     above = _ends(pdv)
+    floor = mean - above[0]
     return (
-        Row("PMU", mean - above[0], least, least, True, "floor of the delay: the PMU with the least of the network"),
+        Row("PMU", floor, least, max(least, floor), True, "floor of the delay: the PMU with the least of the network"),
         Row("Communication", above[0], 0.0, most - least, True, "delay above its floor"),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +43,7 @@ def gist_of(batch: Batch) -> Gist:
     """The columns of a batch, most of them shared with it; its values and its wire are let go."""
     absent: Flags | None = None
     valid: Flags = batch.valid[:, 0] if batch.valid.shape[1] == 1 else np.logical_and.reduce(batch.valid, axis=1)
-    if np.isnan(batch.frequency.sum()) or (batch.phasors.size and np.isnan(batch.phasors.view(np.float64).sum())):
+    if _holds_nan(batch.frequency) or _holds_nan(batch.phasors):
         absent = np.logical_or(np.isnan(batch.frequency).any(1), np.isnan(batch.phasors).any(1))
     return Gist(
         batch.time_ns,
@@ -55,6 +55,12 @@ def gist_of(batch: Batch) -> Gist:
         absent,
         _marks(batch),
     )
+
+
+def _holds_nan(values: npt.NDArray[np.inexact[Any]]) -> bool:
+    """Whether there is a NaN, most likely: infinities of both signs look like one."""
+    total = np.add.reduce(values, axis=None)
+    return bool(total != total)
 
 
 def gathered(parts: Sequence[Gist]) -> Gist:

@@ -85,18 +85,31 @@ class DelayMeter:
     """Delays, from unique frames in order of arrival. ``wait_ns`` is the concentrator's; ``period_ns`` 1/Fs."""
 
     def __init__(self, period_ns: float, wait_ns: int) -> None:
-        self.counts = DelayCounts()
         self.floor, self._evenness = FloorMeter(), EvennessMeter()
+        self.counts = DelayCounts()
         self.wait_ns = wait_ns
         self._period_ns = period_ns
         self._jitter_ns = 0.0
         self._last: tuple[int, int, int] | None = None
+
+    @property
+    def counts(self) -> DelayCounts:
+        """May be exchanged: counting goes on in the new ones."""
+        return self._counts
+
+    @counts.setter
+    def counts(self, counts: DelayCounts) -> None:
+        self._counts, self._evenness.counts = counts, counts.evenness
 
     def restart(self, period_ns: float) -> None:
         """What comes next belongs to another epoch."""
         self._period_ns, self._last = period_ns, None
         self.floor.restart()
         self._evenness.restart()
+
+    def close(self) -> None:
+        """Count what is still gathered."""
+        self._evenness.flush()
 
     def add(self, frames: Frames, ipdv_ns: Ints) -> None:
         """Unique frames, and the IPDV of pairs that they complete."""
@@ -120,7 +133,6 @@ class DelayMeter:
         for unit in RESOLUTIONS_NS:  # each a multiple of the one before
             whole = whole[whole % unit == 0]
             counts.multiples[unit] = counts.multiples.get(unit, 0) + len(whole)
-        self._evenness.counts = counts.evenness
         self._evenness.add(frames.slot, delay)
         self._between(frames)
 

@@ -23,6 +23,7 @@ from pmutools.timebase import NS
 
 SEGMENT = 256
 LEVELS = 16
+GATHER = 512
 BRIDGED = 4
 """Gaps of fewer slots are bridged by a straight line for the periodogram."""
 SPANS_S = (1, 10, 60)
@@ -81,14 +82,20 @@ class EvennessCounts(Counts):
 
 
 class EvennessMeter:
-    """Takes delays of unique frames in order of arrival; those that come after a later slot are passed over."""
+    """Takes delays of unique frames in order of arrival; those that come after a later slot are passed over.
+
+    They are gathered, and counted many at once: :meth:`flush` counts what is left.
+    """
 
     def __init__(self) -> None:
         self.counts = EvennessCounts()
+        self._waiting: list[tuple[Ints, Ints]] = []
+        self._count = 0
         self.restart()
 
     def restart(self) -> None:
         """What comes next has nothing to do with what came before."""
+        self.flush()
         self._slot: int | None = None
         self._delay_ns = self._base_ns = 0
         self._segment: Floats = np.zeros(0)
@@ -96,7 +103,18 @@ class EvennessMeter:
         """(slot, delay) of the last two frames of each level."""
 
     def add(self, slot: Ints, delay_ns: Ints) -> None:
-        """Frames (N,), N >= 1."""
+        """Frames (N,)."""
+        self._waiting.append((slot, delay_ns))
+        self._count += len(slot)
+        if self._count >= GATHER:
+            self.flush()
+
+    def flush(self) -> None:
+        """Count what was gathered."""
+        if not self._count:
+            return
+        slot, delay_ns = (np.concatenate(columns) for columns in zip(*self._waiting, strict=True))
+        self._waiting, self._count = [], 0
         if self._slot is None:
             self._slot, self._delay_ns = int(slot[0]) - 1, int(delay_ns[0])
             self._base_ns = self._delay_ns  # so that floats are exact

@@ -317,6 +317,7 @@ class StreamMeter:
         """The end of the stream: settle all that is open, and tell of it. Nothing may be added after."""
         found = self.drain() + self._flush()
         self._windows.close()
+        self._delays.close()
         self.take_interval()
         self._closed = True
         return found

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from pmutools import timebase
-from pmutools.measure.budget import budget
+from pmutools.measure.budget import Departures, budget
 from pmutools.measure.clockquality import ClockLog, ClockQuality
 from pmutools.measure.completeness import Alignment, curve
 from pmutools.measure.diagnoses import diagnose
@@ -83,9 +83,14 @@ class Whole:
 
 
 def stream_summary(
-    result: StreamResult, clock: ClockLog, others: Sequence[Peer] = (), *, fit: bool = True
+    result: StreamResult,
+    clock: ClockLog,
+    others: Sequence[Peer] = (),
+    *,
+    fit: bool = True,
+    departures: Departures | None = None,
 ) -> dict[str, Any]:
-    """One stream's part."""
+    """One stream's part; ``departures`` are what the sender's ledger tells of it."""
     counts, identity = result.counts, result.identity
     sure = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns)
     locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
@@ -94,6 +99,7 @@ def stream_summary(
     skew, peak = result.course.skew(), counts.delays.evenness.peak(result.period_ns)
     names = [station.name for station in result.config.stations]
     diagnoses = diagnose(Scene(result, clock, others))
+    rows = budget(counts.delays.delay, counts.delays.pdv, counts.windows.to_tick, departures=departures)
     return safe(
         {
             "name": identity.name,
@@ -136,7 +142,8 @@ def stream_summary(
             ],
             "first": _utc(result.first_ns),
             "last": _utc(result.last_ns),
-            "budget": [row.to_json() for row in budget(counts.delays.delay, counts.delays.pdv, counts.windows.to_tick)],
+            "one_way_ms": departures.one_way.summary_ms() if departures else None,
+            "budget": [row.to_json() for row in rows],
         }
     )
 

@@ -18,6 +18,7 @@ from pmutools.measure.stream import STATES, Seen, State
 
 BUCKETS = 1024
 FIRST_WIDTH_NS = timebase.NS // 10
+_LATE, _DUPLICATE, _CONFLICTING = map(STATES.index, (State.LATE, State.DUPLICATE, State.CONFLICTING))
 _NEVER = np.iinfo(np.int64).max
 _SUMS = ("frames", "total_ns", "delayed", "late", "lost", "duplicated", "unsynchronised", "unusable")
 
@@ -65,30 +66,35 @@ class Timeline:
 
     def add(self, seen: Seen) -> None:
         """What became of frames, in order of arrival, and of the lost."""
-        came = np.where(seen.arrival_ns == NO_TIME, seen.time_ns, seen.arrival_ns)
-        if len(came):
-            at = self._place(came)
-            self._count("frames", at)
-            for name, bits in (("unsynchronised", int(Stat.NOT_SYNCHRONISED)), ("unusable", STAT_DATA_ERROR_MASK)):
-                hit = seen.stat & np.uint16(bits) != 0
-                if hit.any():
-                    self._count(name, at[hit])
-        known = (seen.arrival_ns != NO_TIME) & (seen.state <= STATES.index(State.LATE))
-        if known.any():
-            delay = seen.delay_ns[known]
-            at = self._place(seen.arrival_ns[known])
-            self._lag_ns = int(delay[-1])
-            self._count("delayed", at)
-            self._sums["total_ns"] += np.bincount(at, delay, self._buckets).astype(np.int64)
-            np.minimum.at(self._least, at, delay)
-            np.maximum.at(self._most, at, delay)
-        for name, states in (("late", (State.LATE,)), ("duplicated", (State.DUPLICATE, State.CONFLICTING))):
-            hit = np.isin(seen.state, [STATES.index(state) for state in states])
-            if hit.any():
-                self._count(name, self._place(came[hit]))
+        if len(seen.slot):
+            self._add_frames(seen)
         if len(seen.lost) and seen.rate:
             due = timebase.slot_times_array(seen.lost, seen.rate) + self._lag_ns
             self._count("lost", self._place(due))
+
+    def _add_frames(self, seen: Seen) -> None:
+        unknown = seen.arrival_ns == NO_TIME
+        at = self._place(np.where(unknown, seen.time_ns, seen.arrival_ns))
+        state = seen.state
+        self._count("frames", at)
+        for name, hit in (
+            ("unsynchronised", seen.stat & np.uint16(Stat.NOT_SYNCHRONISED) != 0),
+            ("unusable", seen.stat & np.uint16(STAT_DATA_ERROR_MASK) != 0),
+            ("late", state == _LATE),
+            ("duplicated", (state == _DUPLICATE) | (state == _CONFLICTING)),
+        ):
+            if hit.any():
+                self._count(name, at[hit])
+        first = (state <= _LATE) & ~unknown
+        delay = seen.delay_ns
+        if not first.all():
+            at, delay = at[first], delay[first]
+        if len(delay):
+            self._lag_ns = int(delay[-1])
+            self._count("delayed", at)
+            np.add.at(self._sums["total_ns"], at, delay)
+            np.minimum.at(self._least, at, delay)
+            np.maximum.at(self._most, at, delay)
 
     def course(self) -> Course | None:
         """All so far; None where nothing was."""
@@ -100,7 +106,9 @@ class Timeline:
         return Course(self._start_ns, self._width_ns, least_ns=self._least[:end], most_ns=self._most[:end], **sums)
 
     def _count(self, name: str, at: npt.NDArray[np.intp]) -> None:
-        self._sums[name] += np.bincount(at, minlength=self._buckets)
+        low = int(at.min())
+        counts = np.bincount(at - low)
+        self._sums[name][low : low + len(counts)] += counts
 
     def _place(self, times: Ints) -> npt.NDArray[np.intp]:
         """Buckets of UTC times; what lies before the first goes to the first (a clock that was set back)."""

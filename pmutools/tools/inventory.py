@@ -15,8 +15,11 @@ from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.describe import describe_station
 from pmutools.formats.source import Block, Source
-from pmutools.measure.slots import OFF_GRID_SHARE
-from pmutools.tools.slots import SlotCounts
+from pmutools.measure.columns import frames_of, gist_of
+from pmutools.measure.slotmeter import SlotMeter
+from pmutools.measure.slots import HORIZON_S, SlotCounts
+
+HORIZON_NS = round(HORIZON_S * timebase.NS)
 
 
 @dataclass

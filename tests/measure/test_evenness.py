@@ -64,6 +64,7 @@ def test_allan_deviation_is_that_of_its_definition() -> None:
     meter = EvennessMeter()
     for at in range(0, count, 100):
         meter.add(slot[at : at + 100], delay[at : at + 100])
+    meter.flush()
     found = meter.counts.allan(PERIOD_NS)
     for level in (0, 1, 5):
         step = 1 << level

@@ -9,7 +9,7 @@ import pytest
 from support.measured import MS, arranged, batch, measured, stamps
 
 from pmutools.flow import StampSource
-from pmutools.measure.budget import TABLE_I, budget
+from pmutools.measure.budget import TABLE_I, Departures, budget
 from pmutools.measure.clockquality import ChronyClock, ClockLog, ClockQuality, GpsClock, KernelClock, PtpClock
 from pmutools.measure.histogram import Histogram
 from pmutools.measure.quality import QualityCounts
@@ -166,8 +166,8 @@ def test_budget_from_a_receiver_alone() -> None:
 
 def test_budget_with_the_sender_seen() -> None:
     sent = Histogram(np.full(100, 44 * MS))
-    delay = Histogram(np.full(100, 60 * MS))
-    rows = budget(delay, Histogram(np.zeros(100)), Histogram(), at_sender=sent, command_ms=11.0)
+    delay, way = Histogram(np.full(100, 60 * MS)), Histogram(np.full(100, 16 * MS))
+    rows = budget(delay, Histogram(np.zeros(100)), Histogram(), departures=Departures(sent, way), command_ms=11.0)
     assert [(row.mean_ms, row.measured) for row in rows] == [
         (44, True),
         (16, True),

@@ -1,0 +1,86 @@
+"""Who a stream is: frames of many flows to one stream with one name, through reconnections and restarts.
+
+A stream that the user asked for is known by the endpoints it belongs to and its IDCODE: whatever connection or source
+port it comes by, it is the same. In a recording it is known by what stays when a device is started anew: over UDP the
+address it sends to, over TCP its own address and the receiver's host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import NamedTuple
+
+from pmutools.c37118.config import StreamConfig
+from pmutools.flow import Flow
+from pmutools.measure.stream import Identity
+from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, parse_endpoint
+from pmutools.parsers import unique
+from pmutools.sites import Site, streams_of
+
+Owners = Callable[[Flow, int], tuple[int, ...]]
+"""Places of the endpoints that a flow's IDCODE belongs to."""
+
+
+class Wanted(NamedTuple):
+    """What the user asked for: an endpoint, the sites that are in its stream, and their rate."""
+
+    endpoint: Endpoint
+    sites: tuple[str, ...] = ()
+    rate: int | None = None
+
+    @property
+    def label(self) -> str:
+        """What it is called where nothing of it has come."""
+        return "+".join(self.sites) or str(self.endpoint)
+
+
+def wanted_of(urls: Iterable[str], sites: Iterable[Site] = ()) -> tuple[Wanted, ...]:
+    """What a command line and an initialisation file ask for, each once. Raises SettingsError for a wrong URL."""
+    found = [Wanted(stream.endpoint, tuple(s.name for s in stream.sites), stream.rate) for stream in streams_of(sites)]
+    return (*found, *(Wanted(endpoint) for endpoint in dict.fromkeys(map(parse_endpoint, urls))))
+
+
+def nobody(flow: Flow, idcode: int) -> tuple[int, ...]:
+    """The owners of what comes from a recording."""
+    return ()
+
+
+def key_of(flow: Flow, idcode: int, owners: tuple[int, ...]) -> Hashable:
+    """Equal for what is one stream."""
+    if owners:
+        return owners, idcode
+    if flow.transport == "udp":
+        return "udp", flow.destination, idcode
+    if flow.transport == "tcp":
+        return "tcp", flow.source, flow.destination.rpartition(":")[0], idcode
+    return flow._replace(connection=0), idcode
+
+
+def identity_of(
+    flow: Flow, config: StreamConfig, owners: tuple[int, ...], wanted: Sequence[Wanted], taken: Iterable[str]
+) -> Identity:
+    """What a new stream is called: as its sites, as its only station, or by its IDCODE; not as those ``taken``."""
+    mine = [wanted[place] for place in owners]
+    sites = [site for each in mine for site in each.sites]
+    stations = [station.name for station in config.stations]
+    lone = stations[0] if len(stations) == 1 and stations[0] else str(config.idcode)
+    (name,) = unique(("+".join(sites) or lone,), taken)
+    others = tuple(dict.fromkeys(other for other in (*sites, *stations, str(config.idcode)) if other != name))
+    where = str(mine[0].endpoint) if mine else " > ".join(filter(None, (flow.source, flow.destination)))
+    rate = next((each.rate for each in mine if each.rate), None)
+    return Identity(name, config.idcode, flow.transport, _to_group(flow), where, rate, others)
+
+
+def silent_identity(wanted: Wanted, taken: Iterable[str]) -> Identity:
+    """What an endpoint is called that nothing came from."""
+    (name,) = unique((wanted.label,), taken)
+    endpoint = wanted.endpoint
+    transport = "tcp" if endpoint.scheme is Scheme.TCP else "udp"
+    return Identity(
+        name, endpoint.idcode or 0, transport, is_multicast(endpoint.host), str(endpoint), wanted.rate, wanted.sites
+    )
+
+
+def _to_group(flow: Flow) -> bool:
+    host = flow.destination.rpartition(":")[0].strip("[]")
+    return flow.transport == "udp" and bool(host) and is_multicast(host)
