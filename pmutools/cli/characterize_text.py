@@ -37,6 +37,8 @@ def told(
     yield from _table(rows)
     if len(shown) < len(streams):
         yield f"({len(streams) - len(shown)} more streams that fare better; -v shows all, summary.json holds all)"
+    if summary["all"]["received"] and not summary["all"]["delay_ms"]["count"]:
+        yield "no arrival times: of delays, windows and jitter nothing can be told"
     yield from _section("", _diagnoses(streams))
     yield from _section("", _budget(summary))
     yield from _section("", _ledger(summary))

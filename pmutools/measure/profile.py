@@ -1,35 +1,65 @@
 """What was measured, as an impairment profile: ``pmu play`` then treats any recording as this network did.
 
-Losses become a Gilbert model of the same ratio and mean burst, copies a chance.
+Delays become a distribution with the measured correlation of successive frames, and keep their order where no frame
+overtook another; losses a Gilbert model of the same ratio and mean burst; copies a chance. Delays are counted from the
+stamp, so the player must send by the stamp too (``--timing stamp``): with recorded latencies they would come twice.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from pmutools.measure.fits import best_fit, histogram_text, typical
 from pmutools.measure.stream import StreamResult
 
+LEAST_CORRELATION = 0.05
+"""Less is told as none."""
+MOST_CORRELATION = 0.99
+_HEAD = "; as measured; delays in ms from the stamp: play with --timing stamp"
+_PLAIN = re.compile(r"[^\W_][\w .+-]*")
+
 
 def profile_text(results: Sequence[StreamResult], *, exact: bool = False) -> str:
     """An INI profile with a section a stream. ``exact``: histograms in place of fitted distributions."""
-    return "\n".join(["; as measured; delays in ms", *(line for result in results for line in _section(result, exact))])
+    return "\n".join([_HEAD, *(line for result in results for line in _section(result, exact))])
 
 
 def _section(result: StreamResult, exact: bool) -> list[str]:
     counts = result.counts
-    lines = ["", f"[stream {result.identity.name}]"]
+    if not counts.slots.received:
+        return []
+    lines = ["", f"[stream {', '.join(_patterns(result))}]"]
     delays, of = typical(counts.delays)
     if of == "pdv":
         lines.append("; above the floor: by the delays themselves a clock is wrong")
     if fit := best_fit(delays):
-        lines.append(f"delay = {histogram_text(delays) if exact else fit.text}")
+        lines.append(f"delay = {histogram_text(delays) if exact else fit.text}{_manner(result)}")
         lines.append(f"; {fit.name}, KS distance {fit.ks:.3f}, {fit.frames} frames" if not exact else "; as counted")
     if loss := loss_text(counts.slots.lost, counts.slots.expected, counts.losses.periods.mean):
         lines.append(f"loss = {loss}")
-    if counts.slots.duplicated and counts.slots.received:
+    if counts.slots.duplicated:
         lines.append(f"duplicate = {min(1.0, counts.slots.duplicated / counts.slots.received):.4%}")
     return lines
+
+
+def _patterns(result: StreamResult) -> list[str]:
+    """What a player calls the stream: as it was called here, as its only station, or by its IDCODE."""
+    identity, stations = result.identity, result.config.stations
+    names = [identity.name, *(station.name for station in stations if len(stations) == 1)]
+    return [name for name in dict.fromkeys(names) if _PLAIN.fullmatch(name)] or [str(identity.idcode)]
+
+
+def _manner(result: StreamResult) -> str:
+    """How successive delays depend on each other."""
+    delays, told = result.counts.delays, ""
+    correlation = delays.correlation or 0.0
+    if correlation >= LEAST_CORRELATION:
+        told += f" corr={min(correlation, MOST_CORRELATION):.1%}"
+    least, most = delays.pdv.quantiles_ns((0.001, 0.999))
+    if not result.counts.order.reordered and least is not None and most is not None:
+        told += " order=keep" if most - least > result.period_ns > 0 else ""
+    return told
 
 
 def loss_text(lost: int, expected: int, mean_burst: float | None) -> str | None:

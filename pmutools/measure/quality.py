@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.c37118.batch import STAMP_SOURCES
+from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import (
     DataError,
@@ -53,7 +53,7 @@ class QualityCounts(Counts):
     stat: dict[tuple[int, int], int] = field(default_factory=dict)
     """Frames by (station's number, STAT)."""
     source: dict[int, int] = field(default_factory=dict)
-    """Frames by index into STAMP_SOURCES."""
+    """Frames that somebody saw come, by index into STAMP_SOURCES."""
     time_quality_changes: int = 0
     sync_changes: int = 0
     config_changes: int = 0
@@ -171,7 +171,8 @@ class QualityMeter:
             usable = usable & ~gist.absent
         counts.usable += int(np.count_nonzero(usable))
         _count(counts.time_quality, gist.time_quality)
-        _count(counts.source, gist.stamp_source)
+        unknown = gist.arrival_ns == NO_TIME
+        _count(counts.source, gist.stamp_source[~unknown] if unknown.any() else gist.stamp_source)
         first = gist.stat[0]
         alike = bool((gist.stat == first).all())
         for number, word in enumerate(first.tolist()):
@@ -201,6 +202,8 @@ class QualityMeter:
 
 
 def _count(found: dict[int, int], codes: npt.NDArray[np.unsignedinteger[Any]]) -> None:
+    if not codes.size:
+        return
     first = codes[0]
     if (codes == first).all():
         found[int(first)] = found.get(int(first), 0) + len(codes)

@@ -27,6 +27,10 @@ class Chores:
             self._run(name, None)
         self._running[name], self.took_ns[name] = work, 0
 
+    def drop(self, name: str) -> None:
+        """Give up what is not done."""
+        self._running.pop(name, None)
+
     def work(self, budget_ns: int = BUDGET_NS) -> None:
         """Go on for so long, and at least a step."""
         end_ns = self._now_ns() + budget_ns

@@ -82,10 +82,10 @@ class Recorder:
         if self._intervals is not None and not self._live:
             self._intervals.write_ready()
         elif self._intervals is not None and now_ns >= self._interval_ns:
-            self._interval_ns += max(1, (now_ns - self._interval_ns) // self._intervals.period_ns + 1) * (
-                self._intervals.period_ns
-            )
-            self._start_interval(utc_ns)
+            period_ns = self._intervals.period_ns
+            self._interval_ns += ((now_ns - self._interval_ns) // period_ns + 1) * period_ns
+            if not self._chores.busy(INTERVALS):  # else this one goes on, and is longer
+                self._start_interval(utc_ns)
         if now_ns >= self._checkpoint_ns and not self._chores.busy(SUMMARY):
             took_ns = self._chores.took_ns.get(SUMMARY, 0)
             self._checkpoint_ns = now_ns + max(CHECKPOINT_NS, CHECKPOINT_SHARE * took_ns)
@@ -94,14 +94,16 @@ class Recorder:
 
     def close(self, utc_ns: int) -> None:
         """The end, before the engine is closed: the last interval; a checkpoint that is on its way is given up."""
+        self._chores.drop(SUMMARY)
+        self._chores.finish()
         if self._intervals is not None and self._live:
             self._start_interval(utc_ns)
             self._chores.finish()
+        elif self._intervals is not None:
+            self._intervals.finish()
 
     def finish(self) -> None:
         """After the engine was closed: finish the files."""
-        if self._intervals is not None and not self._live:
-            self._intervals.finish()
         for output in (self.samples, self._lines):
             if output is not None:
                 try:

@@ -336,8 +336,8 @@ def _pairs(copies: _Copies, frames: _Frames) -> Ints:
     if not len(copies.key) or not len(frames.key):
         return found
     # sent copies first among those of one stamp, in order of departure
-    unsent = copies.when == NO_TIME
-    order = np.lexsort((np.where(unsent, 1 << 62, copies.when), copies.key, copies.stream))
+    when = np.where(copies.when == NO_TIME, 1 << 62, copies.when)
+    order = np.lexsort((when, copies.key, copies.stream))
     stream, key = copies.stream[order], copies.key[order]
     starts = np.flatnonzero(np.concatenate(([True], (np.diff(stream) != 0) | (np.diff(key) != 0))))
     ends = np.append(starts[1:], len(order))
@@ -352,16 +352,33 @@ def _pairs(copies: _Copies, frames: _Frames) -> Ints:
     for row in several[np.argsort(frames.when[several], kind="stable")].tolist():
         by_group.setdefault(int(at[row]), []).append(row)
     for group, arrivals in by_group.items():
-        left = order[starts[group] : ends[group]].tolist()
-        for row in reversed(arrivals):
-            before = [copy for copy in left if copies.when[copy] != NO_TIME and copies.when[copy] <= frames.when[row]]
-            copy = before[-1] if before else next((c for c in reversed(left) if copies.when[c] != NO_TIME), None)
-            if copy is None and left:
-                copy = left[-1]
+        mine = order[starts[group] : ends[group]].tolist()
+        sent = [copy for copy in mine if copies.when[copy] != NO_TIME]
+        unsent = mine[len(sent) :]
+        for row, copy in zip(
+            arrivals, _assigned(copies.when[sent].tolist(), frames.when[arrivals].tolist()), strict=True
+        ):
             if copy is not None:
-                left.remove(copy)
-                found[row] = copy
+                found[row] = sent[copy]
+            elif unsent:
+                found[row] = unsent.pop(0)
     return found
+
+
+def _assigned(departures: Sequence[int], arrivals: Sequence[int]) -> Iterator[int | None]:
+    """Which of the departures each arrival belongs to, both in order: the latest by then that is not taken.
+
+    In order where that fits, or where no clock explains the arrivals.
+    """
+    if len(departures) == len(arrivals) and all(left <= came for left, came in zip(departures, arrivals, strict=True)):
+        yield from range(len(arrivals))
+        return
+    free = list(range(len(departures)))
+    for came in arrivals:
+        copy = next((copy for copy in reversed(free) if departures[copy] <= came), free[0] if free else None)
+        if copy is not None:
+            free.remove(copy)
+        yield copy
 
 
 def _rank(stream: npt.NDArray[np.int32], key: Ints, frames: _Frames) -> Ints:
