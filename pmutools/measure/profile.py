@@ -56,10 +56,7 @@ def _manner(result: StreamResult) -> str:
     correlation = delays.correlation or 0.0
     if correlation >= LEAST_CORRELATION:
         told += f" corr={min(correlation, MOST_CORRELATION):.1%}"
-    least, most = delays.pdv.quantiles_ns((0.001, 0.999))
-    if not result.counts.order.reordered and least is not None and most is not None:
-        told += " order=keep" if most - least > result.period_ns > 0 else ""
-    return told
+    return told if result.counts.order.reordered else f"{told} order=keep"
 
 
 def loss_text(lost: int, expected: int, mean_burst: float | None) -> str | None:

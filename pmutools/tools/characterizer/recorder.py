@@ -23,6 +23,7 @@ from pmutools.tools.characterizer.telling import checkpoint
 FLUSH_NS = NS
 """What a run that is killed can lose of its files; of more than 16 streams also what is gathered of each."""
 CHECKPOINT_NS = 10 * NS
+"""How often the summary is written meanwhile; with shorter intervals, at each of them."""
 CHECKPOINT_SHARE = 20
 """Checkpoints take at most one part in so many of the time."""
 
@@ -54,7 +55,8 @@ class Recorder:
         self._lines: OutputFile | None = None
         self._intervals: Intervals | None = None
         now_ns = monotonic_ns()
-        self._flush_ns, self._checkpoint_ns = now_ns + FLUSH_NS, now_ns + CHECKPOINT_NS
+        self._period_ns = min(CHECKPOINT_NS, interval_ns or CHECKPOINT_NS)
+        self._flush_ns, self._checkpoint_ns = now_ns + FLUSH_NS, now_ns + self._period_ns
         if samples:
             self.samples = Samples(folder.path)
             engine.sinks.append(self._sample)
@@ -88,7 +90,7 @@ class Recorder:
                 self._start_interval(utc_ns)
         if now_ns >= self._checkpoint_ns and not self._chores.busy(SUMMARY):
             took_ns = self._chores.took_ns.get(SUMMARY, 0)
-            self._checkpoint_ns = now_ns + max(CHECKPOINT_NS, CHECKPOINT_SHARE * took_ns)
+            self._checkpoint_ns = now_ns + max(self._period_ns, CHECKPOINT_SHARE * took_ns)
             self._chores.start(SUMMARY, checkpoint(self._engine, lambda: self._run(utc_ns), utc_ns, self._put_summary))
         self._chores.work()
 
