@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pmutools.tools.characterizer.job import Job, Outcome, Settings
 
 PROGRESS_NS = NS // 2
+TOLD_REASONS = 3
 
 
 @click.command(name="characterize", short_help="How late, how even, how lossy streams come.")
@@ -68,15 +69,14 @@ def command(as_json: bool, quiet: bool, verbose: int, no_report: bool, **said: A
     _check(asked)
     live = asked.ini is not None or is_live(asked.targets[0])
     with interruptible() as stop:
-        job = _live(asked, talk, verbose, stop) if live else _recorded(asked, talk, stop)
+        job, why = _live(asked, talk, verbose, stop) if live else _recorded(asked, talk, stop)
         outcome = job.finish()
         stopped = stop()
     if not no_report:
         _report(outcome, asked.out, talk)
     _tell(outcome, talk, as_json=as_json, quiet=quiet, verbose=verbose)
     if not outcome.received:
-        silent = [stream["diagnoses"][0]["text"] for stream in outcome.run.summary["streams"] if stream["diagnoses"]]
-        raise SourceError(f"no data from {asked.name}: {silent[0] if silent else 'it holds no C37.118 data frame'}")
+        raise SourceError(f"no data from {asked.name}: {why()}")
     if stopped:
         return Exit.INTERRUPTED
     if outcome.failures:
@@ -138,16 +138,21 @@ def _settings(asked: Asked) -> Settings:
     )
 
 
-def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> Job:
+Why = Callable[[], str]
+"""Why nothing came, as part of a sentence."""
+
+
+def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> tuple[Job, Why]:
     """Bind first: what has to be imported after that is slow."""
     from pmutools.cli.news import News
     from pmutools.sites import load_sites
-    from pmutools.tools.characterizer.naming import wanted_of
+    from pmutools.tools.characterizer.wanted import wanted_of
     from pmutools.tools.live import LiveSource
 
     sites = load_sites(asked.ini) if asked.ini is not None else ()
     wanted = wanted_of(asked.targets, sites)
-    hearing: list[Callable[[LinkEvent], None]] = [News(talk, verbose)]
+    news = News(talk, verbose)
+    hearing: list[Callable[[LinkEvent], None]] = [news]
 
     def tell(event: LinkEvent) -> None:
         for hear in hearing:
@@ -170,10 +175,10 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> J
         job = Job(engine, Folder(asked.out), settings, source.clock, source=asked.name)
         watch = stack.enter_context(ClockWatch())
         job.live(source, lambda: watch.quality, _progress(talk))
-    return job
+    return job, lambda: "; ".join(dict.fromkeys(map(news.reasons.why, range(min(len(wanted), TOLD_REASONS)))))
 
 
-def _recorded(asked: Asked, talk: Talk, stop: Callable[[], bool]) -> Job:
+def _recorded(asked: Asked, talk: Talk, stop: Callable[[], bool]) -> tuple[Job, Why]:
     from pmutools.cli.sources import Cut
     from pmutools.clock import SystemClock
     from pmutools.tools.characterizer.engine import Engine
@@ -186,7 +191,7 @@ def _recorded(asked: Asked, talk: Talk, stop: Callable[[], bool]) -> Job:
     job = Job(Engine(wait_ns=settings.wait_ns), Folder(asked.out), settings, SystemClock(), source=asked.name)
     cut = source if asked.duration_ns is None else Cut(source, asked.duration_ns)
     job.recorded(cut, _progress(talk), stop)
-    return job
+    return job, lambda: f"no C37.118 data frames found in {source.tally.fed} bytes of payload"
 
 
 def _saved(sites: tuple[Site, ...]) -> tuple[StreamConfig, ...]:

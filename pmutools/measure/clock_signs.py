@@ -16,7 +16,7 @@ SMEAR_PPM = 11.6
 
 def _receiver(scene: Scene) -> str | None:
     clock = scene.clock
-    if not clock.samples or (clock.bound_ns is not None and not clock.steps):
+    if not clock.samples or not scene.result.counts.slots.frames or (clock.bound_ns is not None and not clock.steps):
         return None
     if clock.steps:
         return (

@@ -337,7 +337,7 @@ def test_the_folder_of_the_earlier_run_is_not_overwritten(tmp_path: Path) -> Non
 def test_a_capture_of_something_else_fails_and_says_so(foreign: Path, tmp_path: Path) -> None:
     result = run_here("characterize", foreign, "--out", tmp_path / "run", "--no-report", "--quiet")
     assert result.code == 1
-    assert "no C37.118 data frame" in result.complaint
+    assert "no C37.118 data frames found" in result.complaint
 
 
 def test_an_empty_file_is_no_recording(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from pmutools.net.dialogue import LinkEvent
 from pmutools.tools.characterizer.engine import Engine
 from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.job import Job, Outcome, Settings
-from pmutools.tools.characterizer.naming import wanted_of
+from pmutools.tools.characterizer.wanted import wanted_of
 from pmutools.tools.live import LiveSource
 
 pytestmark = pytest.mark.realtime

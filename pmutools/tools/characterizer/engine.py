@@ -25,7 +25,8 @@ from pmutools.measure.stream import WAIT_NS, Identity, Seen, StreamMeter, Stream
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.tools.characterizer.chronicle import Chronicle
 from pmutools.tools.characterizer.gauge import Gauge, Seat
-from pmutools.tools.characterizer.naming import Owners, Wanted, identity_of, key_of, nobody, silent_identity
+from pmutools.tools.characterizer.naming import Owners, identity_of, key_of, nobody, silent_identity
+from pmutools.tools.characterizer.wanted import Wanted
 from pmutools.tools.news import USUAL, told
 
 MAX_STREAMS = 4096

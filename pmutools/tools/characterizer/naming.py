@@ -8,36 +8,16 @@ address it sends to, over TCP its own address and the receiver's host.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import NamedTuple
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.flow import Flow
 from pmutools.measure.stream import Identity
-from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, parse_endpoint
+from pmutools.net.endpoint import Scheme, is_multicast
 from pmutools.parsers import unique
-from pmutools.sites import Site, streams_of
+from pmutools.tools.characterizer.wanted import Wanted
 
 Owners = Callable[[Flow, int], tuple[int, ...]]
 """Places of the endpoints that a flow's IDCODE belongs to."""
-
-
-class Wanted(NamedTuple):
-    """What the user asked for: an endpoint, the sites that are in its stream, and their rate."""
-
-    endpoint: Endpoint
-    sites: tuple[str, ...] = ()
-    rate: int | None = None
-
-    @property
-    def label(self) -> str:
-        """What it is called where nothing of it has come."""
-        return "+".join(self.sites) or str(self.endpoint)
-
-
-def wanted_of(urls: Iterable[str], sites: Iterable[Site] = ()) -> tuple[Wanted, ...]:
-    """What a command line and an initialisation file ask for, each once. Raises SettingsError for a wrong URL."""
-    found = [Wanted(stream.endpoint, tuple(s.name for s in stream.sites), stream.rate) for stream in streams_of(sites)]
-    return (*found, *(Wanted(endpoint) for endpoint in dict.fromkeys(map(parse_endpoint, urls))))
 
 
 def nobody(flow: Flow, idcode: int) -> tuple[int, ...]:
