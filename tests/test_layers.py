@@ -22,6 +22,7 @@ LAYERS = [
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],
     ["pmutools.grid", "pmutools.formats", "pmutools.measure", "pmutools.sites"],
     ["pmutools.clocksources"],
+    ["pmutools.report"],
     ["pmutools.tools"],
     ["pmutools.cli", "pmutools.stream"],
     # the controller

@@ -246,14 +246,18 @@ def histogram_text(measured: Histogram, most_bins: int = MOST_BINS) -> str:
     return f"histogram({',  '.join(rows)})"
 
 
+def quantile_table(text: str) -> tuple[Floats, Floats]:
+    """Shares (Q,), close together at both ends, and the values in ms that those shares of ``text`` do not exceed."""
+    draws = 1 / (1 + np.exp(-np.linspace(-16, 16, _QUANTILES)))
+    return draws, distribution(text).quantile()(draws)
+
+
 def ks_distance(text: str, measured: Histogram) -> float:
     """The largest difference of the distribution functions of ``text`` (ms) and of what was measured."""
     bins = measured.bins()
     share = np.cumsum(bins.count) / measured.count
     edges = np.minimum(bins.high_ns, measured.max_ns or 0) / NS_PER_MS
-    grid = np.linspace(-16, 16, _QUANTILES)
-    draws = 1 / (1 + np.exp(-grid))
-    values = distribution(text).quantile()(draws)
+    draws, values = quantile_table(text)
     at = np.interp(edges, values, draws, left=0.0, right=1.0)
     below = np.interp(bins.low_ns / NS_PER_MS, values, draws, left=0.0, right=1.0)
     before = np.concatenate(([0.0], share[:-1]))

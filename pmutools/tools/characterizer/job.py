@@ -19,13 +19,13 @@ from pmutools.measure.clockquality import ClockQuality
 from pmutools.measure.compare import compare
 from pmutools.measure.profile import profile_text
 from pmutools.measure.require import Requirement, verdicts
+from pmutools.measure.run import Run
 from pmutools.measure.stream import WAIT_NS, StreamResult
 from pmutools.measure.timeline import Course
 from pmutools.timebase import NS
 from pmutools.tools.characterizer.engine import Engine
 from pmutools.tools.characterizer.folder import SUMMARY, Folder
 from pmutools.tools.characterizer.recorder import Recorder
-from pmutools.tools.characterizer.run import Run
 from pmutools.tools.characterizer.telling import final_summary, results_of, run_part
 from pmutools.tools.characterizer.truth import Truth, hold_to
 from pmutools.tools.live import ROUND_NS, LiveSource

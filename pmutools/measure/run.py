@@ -33,3 +33,9 @@ class Run:
     """Of ``--require``."""
     differences: Sequence[Difference] = ()
     """Of ``--compare``."""
+    intervals: Sequence[tuple[int, Mapping[str, Any]]] = ()
+    """(UTC ns of its end, :func:`~pmutools.measure.summary.interval_summary` of all streams together)."""
+    compared_with: str = ""
+    """What the differences are against, as the user named it."""
+    command: str = ""
+    """The command line that measured it."""
