@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from importlib import import_module
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +74,7 @@ def command(as_json: bool, quiet: bool, verbose: int, no_report: bool, **said: A
         outcome = job.finish()
         stopped = stop()
     if not no_report:
-        _report(outcome, asked.out, talk)
+        _report(outcome, asked, talk)
     _tell(outcome, talk, as_json=as_json, quiet=quiet, verbose=verbose)
     if not outcome.received:
         raise SourceError(f"no data from {asked.name}: {why()}")
@@ -219,15 +220,24 @@ def _progress(talk: Talk) -> Callable[[Engine], None]:
     return observe
 
 
-def _report(outcome: Outcome, out: Path, talk: Talk) -> None:
+def _report(outcome: Outcome, asked: Asked, talk: Talk) -> None:
     """The report and the figures, where what they need is installed."""
+    from pmutools.report import write_report
+    from pmutools.report.intervals import read_intervals
+    from pmutools.tools.characterizer.folder import INTERVALS
+
+    talk.progress("writing the report")
+    run = replace(
+        outcome.run,
+        intervals=read_intervals(asked.out / INTERVALS),
+        compared_with="" if asked.before is None else str(asked.before),
+        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    )
     try:
-        write_report = import_module("pmutools.report").write_report
-    except ImportError as error:
-        talk.say(f"no report.html and no figures ({error}); they need pmutools[analysis]")
-        return
-    try:
-        outcome.paths.extend(write_report(outcome.run, out))
+        page, *figures = write_report(run, asked.out)
+        outcome.paths += [page, *sorted({path.parent for path in figures})]
+    except SettingsError as error:
+        talk.say(f"no report.html and no figures: {error}")
     except SourceError as error:
         outcome.failures.append(str(error))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -385,10 +386,8 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     assert result.code == 1 and "cannot make the folder" in result.complaint
 
 
-def test_without_the_report_package_all_else_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "pmutools.report", None)
+def test_without_what_a_report_needs_all_else_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plotly", None)
     result = run_here("characterize", CJB, "--out", tmp_path / "run", "--duration", 1)
     assert result.code == 0
     assert "no report.html and no figures" in result.err
