@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 from pmutools.errors import SettingsError, SourceError
+from pmutools.formats.naming import Namer, stream_name
 from pmutools.formats.sink import Sink, SinkOptions
 
 if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
+    from pmutools.formats.fields import Fields
     from pmutools.formats.source import Source
 
 __all__ = ["FORMATS", "UNSAID", "FileFormat", "Nominal", "Sink", "SinkOptions", "open_sink", "open_source"]
@@ -31,7 +33,8 @@ _COMPRESSED = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 class FileFormat(NamedTuple):
     """One kind of file: its suffixes, its module, the bytes it may begin with, and whether it may be compressed.
 
-    ``inferred`` says that its configuration may have to be inferred.
+    ``inferred`` says that its configuration may have to be inferred, ``tabular`` that it is made of columns,
+    ``streamed`` that it may go to standard output.
     """
 
     kind: str
@@ -41,6 +44,8 @@ class FileFormat(NamedTuple):
     compressible: bool = False
     written: bool = True
     inferred: bool = False
+    tabular: bool = False
+    streamed: bool = False
 
 
 class Nominal(NamedTuple):
@@ -66,14 +71,14 @@ _PCAP_MAGICS = tuple(
 _FRAME_MAGICS = tuple(bytes((0xAA, kind << 4 | version)) for kind in range(6) for version in (1, 2))
 
 FORMATS = (
-    FileFormat("pcap", (".pcap",), "pcap", _PCAP_MAGICS, compressible=True),
-    FileFormat("pcapng", (".pcapng",), "pcap", (b"\n\r\r\n",), compressible=True),
+    FileFormat("pcap", (".pcap",), "pcap", _PCAP_MAGICS, compressible=True, streamed=True),
+    FileFormat("pcapng", (".pcapng",), "pcap", (b"\n\r\r\n",), compressible=True, streamed=True),
     FileFormat("mcap", (".mcap",), "mcap", (b"\x89MCAP0\r\n",)),
-    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",), inferred=True),
-    FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",), inferred=True),
-    FileFormat("raw", (".c37118", ".pmucapture"), "raw", _FRAME_MAGICS, compressible=True),
-    FileFormat("csv", (".csv",), "csv", compressible=True, inferred=True),
-    FileFormat("jsonl", (".jsonl",), "jsonl", compressible=True, written=False, inferred=True),
+    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",), inferred=True, tabular=True),
+    FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",), inferred=True, tabular=True, streamed=True),
+    FileFormat("raw", (".c37118", ".pmucapture"), "raw", _FRAME_MAGICS, compressible=True, streamed=True),
+    FileFormat("csv", (".csv",), "csv", compressible=True, inferred=True, tabular=True, streamed=True),
+    FileFormat("jsonl", (".jsonl",), "jsonl", compressible=True, inferred=True, streamed=True),
     FileFormat("comtrade", (".cfg", ".dat", ".cff"), "comtrade", written=False, inferred=True),
 )
 
@@ -117,25 +122,69 @@ def open_source(
     return cast("Source", module.read(path, configs))
 
 
-def open_sink(path: str | Path, *, phasors: Literal["polar", "rect"] = "polar", long: bool = False) -> Sink:
-    """Begin a recording whose format is told by its suffix; ``-`` is CSV to standard output.
+def open_sink(
+    path: str | Path,
+    *,
+    form: str | None = None,
+    phasors: Literal["polar", "rect"] = "polar",
+    long: bool = False,
+    fields: Fields | None = None,
+    per_stream: bool = False,
+    name: Namer = stream_name,
+    journal: bool = False,
+) -> Sink:
+    """Begin a recording whose format is told by its suffix; ``-`` is standard output, as CSV unless ``form`` is given.
 
-    ``phasors`` and ``long`` concern tables only.
+    ``form`` is a kind of :data:`FORMATS`; the other arguments are those of :class:`SinkOptions`.
 
     Raises
     ------
     SettingsError
-        The suffix is not known, or not one that is written.
+        The suffix is not known, or not one that is written; something is asked for that the format has not.
     SourceError
         The file cannot be written.
     """
     path = Path(path)
-    form = _by_suffix(path) if path.name != "-" else next(form for form in FORMATS if form.kind == "csv")
-    if form is None or not form.written:
+    stdout = path.name == "-"
+    found = _streamed(form or "csv") if stdout else _by_suffix(path)
+    if found is None or not found.written:
         raise SettingsError(f"cannot write {path}: its suffix is not one of {known_suffixes(written=True)}")
-    if path.suffix.lower() in COMPRESSIONS and not form.compressible:
-        raise SettingsError(f"cannot write {path}: {form.kind} is compressed in itself; leave out {path.suffix}")
-    return cast("Sink", import_module(f"{__name__}.{form.module}").create(path, SinkOptions(phasors, long)))
+    if path.suffix.lower() in COMPRESSIONS and not found.compressible:
+        raise SettingsError(f"cannot write {path}: {found.kind} is compressed in itself; leave out {path.suffix}")
+    if form is not None and form != found.kind:
+        raise SettingsError(f"cannot write {path} as {form}: its suffix says {found.kind}")
+    if stdout and per_stream:
+        raise SettingsError("several files cannot go to standard output; name a file")
+    if (long or fields is not None) and not found.tabular:
+        tables = ", ".join(each.suffixes[0] for each in FORMATS if each.tabular)
+        raise SettingsError(
+            f"{path}: {found.kind} holds whole frames; columns can be chosen, and long form had, of {tables}"
+        )
+    if long and per_stream:
+        raise SettingsError("long form is one file of all streams, and none a stream; choose one")
+    options = SinkOptions(phasors, long, fields, per_stream, name, journal, found.suffixes[0])
+    create = import_module(f"{__name__}.{found.module}").create
+    if per_stream and not found.tabular:
+        from pmutools.formats.per_stream import PerStreamSink
+
+        return PerStreamSink(path, suffix_of(path), create, options)
+    return cast("Sink", create(path, options))
+
+
+def _streamed(form: str) -> FileFormat:
+    kinds = [each.kind for each in FORMATS if each.streamed]
+    if form not in kinds:
+        raise SettingsError(f"{form} cannot go to standard output; one of {', '.join(kinds)} can")
+    return next(each for each in FORMATS if each.kind == form)
+
+
+def suffix_of(path: Path) -> str:
+    """The end of a name that tells its format, with that of a compression; empty where it tells none."""
+    name = path.name.lower()
+    packed = next((each for each in COMPRESSIONS if name.endswith(each)), "")
+    plain = name.removesuffix(packed)
+    known = next((suffix for form in FORMATS for suffix in form.suffixes if plain.endswith(suffix)), "")
+    return path.name[-len(known + packed) :] if known else ""
 
 
 def known_suffixes(*, written: bool = False) -> str:

@@ -17,6 +17,7 @@ from pmutools.c37118.frames import Data, decode_command, decode_header, unpack_d
 from pmutools.c37118.layout import layout_of
 from pmutools.c37118.prefix import Prefix, decode_prefix
 from pmutools.errors import WireError
+from pmutools.flow import Flow
 
 Json = dict[str, Any]
 
@@ -34,9 +35,9 @@ def describe(item: Message | Loss) -> Json:
     frame, _, config = item
     if frame.type is FrameType.DATA:
         assert config is not None
-        return describe_data(unpack_data(frame.data, config, layout_of(config)), frame.arrival_ns)
-    prefix = decode_prefix(frame.data)
-    head = _head(prefix, frame.arrival_ns, config)
+        data = unpack_data(frame.data, config, layout_of(config))
+        return _head(data.prefix, item) | {"stations": _stations(data)}
+    head = _head(decode_prefix(frame.data), item)
     if frame.type.is_config:
         return head | (describe_config(config) if config else {"undecodable": True})
     try:
@@ -48,8 +49,9 @@ def describe(item: Message | Loss) -> Json:
     return head | {"command": command.name, "code": command.code, "extended": command.extended.hex()}
 
 
-def _head(prefix: Prefix, arrival_ns: int | None, config: StreamConfig | None) -> Json:
+def _head(prefix: Prefix, message: Message) -> Json:
     """What every object has. Without a configuration TIME_BASE is unknown, and so is the time."""
+    frame, _, config = message
     time_ns = timebase.to_ns(prefix.soc, prefix.fracsec, config.time_base) if config else None
     return {
         "type": prefix.type.name.lower(),
@@ -59,34 +61,34 @@ def _head(prefix: Prefix, arrival_ns: int | None, config: StreamConfig | None) -
         "time_quality": prefix.time_quality,
         "leap": int(prefix.leap),
         "chk_ok": True,
-        "arrival_ns": arrival_ns,
+        "arrival_ns": frame.arrival_ns,
+        "stamp_source": None if frame.arrival_ns is None else str(frame.stamp_source),
+        "flow": flow_name(message),
         "version": prefix.version,
         "soc": prefix.soc,
         "fracsec": prefix.fracsec,
     }
 
 
-def describe_data(data: Data, arrival_ns: int | None = None) -> Json:
-    """A data frame in SI units."""
-    stations = []
-    for station, values in zip(data.config.stations, data.stations, strict=True):
-        stations.append(
-            {
-                "name": station.name,
-                "idcode": station.idcode,
-                "stat": values.stat,
-                "valid": values.valid,
-                "phasors": [
-                    {"name": channel.name, "kind": channel.kind} | _parts(value)
-                    for channel, value in zip(station.phasors, values.phasors, strict=True)
-                ],
-                "frequency": number(values.frequency),
-                "rocof": number(values.rocof),
-                "analogs": [number(value) for value in values.analogs],
-                "digitals": list(values.digitals),
-            }
-        )
-    return _head(data.prefix, arrival_ns, data.config) | {"stations": stations}
+def _stations(data: Data) -> list[Json]:
+    """The values of a data frame in SI units."""
+    return [
+        {
+            "name": station.name,
+            "idcode": station.idcode,
+            "stat": values.stat,
+            "valid": values.valid,
+            "phasors": [
+                {"name": channel.name, "kind": channel.kind} | _parts(value)
+                for channel, value in zip(station.phasors, values.phasors, strict=True)
+            ],
+            "frequency": number(values.frequency),
+            "rocof": number(values.rocof),
+            "analogs": [number(value) for value in values.analogs],
+            "digitals": list(values.digitals),
+        }
+        for station, values in zip(data.config.stations, data.stations, strict=True)
+    ]
 
 
 def describe_config(config: StreamConfig) -> Json:
@@ -155,6 +157,17 @@ def _analog(channel: AnalogChannel) -> Json:
 
 
 def flow_name(item: Message | Loss) -> str:
-    """``udp 10.0.0.1:4713 > 10.0.0.2:4712``, or the file's name."""
-    flow = item.flow
-    return f"{flow.transport} {flow.source} > {flow.destination}" if flow.destination else flow.source
+    """``udp 10.0.0.1:4713 > 10.0.0.2:4712``, ``tcp 10.0.0.1:4712``, or the file's name."""
+    transport, source, destination, _ = item.flow
+    if transport == "file":
+        return source
+    return f"{transport} {source} > {destination}" if destination else f"{transport} {source}"
+
+
+def flow_of(name: str) -> Flow:
+    """The flow of :func:`flow_name`."""
+    transport, _, places = name.partition(" ")
+    if transport not in ("udp", "tcp"):
+        return Flow("file", name)
+    source, _, destination = places.partition(" > ")
+    return Flow(transport, source, destination)

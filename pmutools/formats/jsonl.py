@@ -1,9 +1,9 @@
-"""``.jsonl``: the objects of ``pmu dump --json``, one a line, made frames again. Read only.
+"""``.jsonl``: the objects of ``pmu dump --json``, one a line; made frames again, and written.
 
 A data object follows the configuration object (``cfg2`` or ``cfg3``) of its IDCODE that came last; its frame is encoded
 under that. Where none came before, one is inferred: the names in the object, all FORMATs float and rectangular, analogs
 and labels without names. Numbers come back as they are printed, integers exactly. Headers, commands, CFG-1 and
-``skipped`` are passed over; lines that are no such objects are counted.
+``skipped`` are passed over; lines that are no such objects are counted. A stream is told by its flow and its IDCODE.
 """
 
 from __future__ import annotations
@@ -47,12 +47,14 @@ from pmutools.errors import PmuError, SourceError
 from pmutools.flow import Flow
 from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.capture.window import Window
+from pmutools.formats.describe import Json, flow_of
 from pmutools.formats.files import END_NS, WindowFile
 from pmutools.formats.infer import data_rate_of, nominal_hz_of, wire_names
+from pmutools.formats.jsonl_sink import create as create
 from pmutools.formats.rows import stamp_code
 from pmutools.formats.source import Block, TableSource
 
-Json = dict[str, Any]
+_Key = tuple[Flow, int]
 BLOCK_ROWS = 1024
 """Objects of a stream held at one time; each takes some kB."""
 _CONFIGS = {"cfg2": FrameType.CFG2, "cfg3": FrameType.CFG3}
@@ -81,8 +83,10 @@ def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UN
 
 class _Reader:
     def __init__(self, path: Path, configs: dict[int, StreamConfig], nominal: Nominal, defects: Counter[str]) -> None:
-        self._path, self._configs, self._nominal, self._defects = path, configs, nominal, defects
-        self._waiting: dict[int, list[Json]] = {}
+        self._path, self._nominal, self._defects = path, nominal, defects
+        self._known = configs
+        self._configs: dict[_Key, StreamConfig] = {}
+        self._waiting: dict[_Key, list[Json]] = {}
 
     def blocks(self) -> Iterator[Block]:
         for item in self._objects():
@@ -93,12 +97,17 @@ class _Reader:
                 if not isinstance(idcode, int) or not 0 <= idcode <= 0xFFFF or _time_ns(item) == NO_TIME:
                     self._defects["data without a time or IDCODE"] += 1
                     continue
-                waiting = self._waiting.setdefault(idcode, [])
+                key = self._flow(item), idcode
+                waiting = self._waiting.setdefault(key, [])
                 waiting.append(item)
                 if len(waiting) >= BLOCK_ROWS:
-                    yield from self._flush(idcode)
-        for idcode in list(self._waiting):
-            yield from self._flush(idcode)
+                    yield from self._flush(key)
+        for key in list(self._waiting):
+            yield from self._flush(key)
+
+    def _flow(self, item: Json) -> Flow:
+        name = item.get("flow")
+        return flow_of(name) if isinstance(name, str) else Flow("file", self._path.name)
 
     def _objects(self) -> Iterator[Json]:
         with Window(self._path) as window:
@@ -123,25 +132,25 @@ class _Reader:
             self._defects["unreadable configurations"] += 1
             return
         self._nominal.refuse(self._path)
-        if self._configs.get(config.idcode) != config:
-            yield from self._flush(config.idcode)
-            self._configs[config.idcode] = config
+        key = self._flow(item), config.idcode
+        if self._configs.get(key) != config:
+            yield from self._flush(key)
+            self._configs[key] = config
 
-    def _flush(self, idcode: int) -> Iterator[Block]:
-        rows = self._waiting.pop(idcode, [])
+    def _flush(self, key: _Key) -> Iterator[Block]:
+        rows = self._waiting.pop(key, [])
         if not rows:
             return
-        config = self._configs.get(idcode)
+        flow, idcode = key
+        config = self._configs.get(key) or self._known.get(idcode) or self._infer(idcode, rows)
         if config is None:
-            config = self._infer(idcode, rows)
-            if config is None:
-                return
-            self._configs[idcode] = config
+            return
+        self._configs[key] = config
         fitting = [row for row in rows if _fits(row, config)]
         if len(fitting) < len(rows):
             self._defects["data that do not fit their configuration"] += len(rows) - len(fitting)
         if fitting:
-            yield Block(Flow("file", self._path.name), batch_of_objects(fitting, config))
+            yield Block(flow, batch_of_objects(fitting, config))
 
     def _infer(self, idcode: int, rows: Sequence[Json]) -> StreamConfig | None:
         for row in rows:
@@ -273,7 +282,7 @@ def batch_of_objects(rows: Sequence[Json], config: StreamConfig) -> Batch:
         config,
         np.array([_time_ns(row) for row in rows], np.int64),
         np.array([_arrival_ns(row) for row in rows], np.int64),
-        np.full(len(rows), stamp_code(None), np.uint8),
+        np.array([stamp_code(row.get("stamp_source")) for row in rows], np.uint8),
         np.array([int(row.get("time_quality", 0)) & 0xFF for row in rows], np.uint8),
         stat,
         phasors,

@@ -46,10 +46,10 @@ class CaptureSink(FrameSink):
     The unknown end of a TCP flow becomes the unspecified address, at the first dynamic port.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, suffix: str) -> None:
         super().__init__(path)
-        self._writer = CaptureWriter(path)
-        self._stamps_needed = ".pcapng" not in path.name.lower()
+        self._writer = CaptureWriter(path, suffix)
+        self._stamps_needed = suffix == ".pcap"
         self._last_ns = 0
 
     def put(self, message: Message) -> None:
@@ -73,4 +73,4 @@ class CaptureSink(FrameSink):
 
 def create(path: Path, options: SinkOptions) -> CaptureSink:
     """Begin a capture; the suffix says which kind."""
-    return CaptureSink(path)
+    return CaptureSink(path, options.suffix)

@@ -8,12 +8,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, Self
 
 from pmutools.c37118.demux import Message
-from pmutools.formats.fields import Fields
 from pmutools.formats.naming import Namer, stream_name
 
 if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
     from pmutools.flow import Flow
+    from pmutools.formats.fields import Fields
     from pmutools.formats.source import Block
 
 Wants = Literal["messages", "blocks"]

@@ -58,12 +58,15 @@ def dissect(pcap: Path, *, decode_as: Sequence[str] = (), timeout_s: float = 60)
 
 
 def differences(ours: Iterable[Object], oracle: Iterable[Object], *, ignore: Sequence[str] = ()) -> list[str]:
-    """Where the two differ, one line each; empty if they agree. Masked values and keys in ``ignore`` are left out."""
+    """Where the two differ, one line each; empty if they agree. Masked values and keys in ``ignore`` are left out.
+
+    So is how a frame came, of which the oracle is not asked.
+    """
     found: list[str] = []
     for index, (mine, theirs) in enumerate(zip_longest(ours, oracle)):
         if mine is None or theirs is None:
             return [*found, f"frame {index} and on: only the {'oracle' if mine is None else 'codec'} has them"]
-        found += _differ(mine, theirs, f"frame {index} ({theirs['type']})", frozenset(ignore))
+        found += _differ(mine, theirs, f"frame {index} ({theirs['type']})", {"flow", "stamp_source", *ignore})
     return found
 
 
@@ -89,7 +92,7 @@ def masked(objects: Iterable[Object]) -> dict[str, int]:
 # --- comparison -------------------------------------------------------------------------------------------------
 
 
-def _differ(mine: Any, theirs: Any, at: str, ignore: frozenset[str]) -> Iterator[str]:
+def _differ(mine: Any, theirs: Any, at: str, ignore: set[str]) -> Iterator[str]:
     if isinstance(theirs, Masked):
         return
     if isinstance(theirs, dict) and isinstance(mine, dict):
