@@ -121,11 +121,11 @@ def _batch(plan: Plan, rows: Rows, chosen: npt.NDArray[np.bool_] | None) -> Batc
     return batch_of(config, columns, frames, values, exact=exact)
 
 
-def idcodes_of(numbers: npt.NDArray[np.float64] | None, count: int) -> npt.NDArray[np.int64]:
-    """(N,) IDCODEs, :data:`NO_IDCODE` where the file gives none."""
+def idcodes_of(numbers: npt.NDArray[np.float64] | None, count: int, default: int = NO_IDCODE) -> npt.NDArray[np.int64]:
+    """(N,) IDCODEs, ``default`` where the file gives none."""
     if numbers is None:
-        return np.full(count, NO_IDCODE)
-    whole = np.where(np.isfinite(numbers), numbers, NO_IDCODE)
+        return np.full(count, default)
+    whole = np.where(np.isfinite(numbers), numbers, default)
     return np.clip(whole, 0, 0xFFFF).astype(np.int64)
 
 

@@ -31,7 +31,7 @@ from pmutools.errors import PmuError, SourceError, WireError
 from pmutools.formats import UNSAID, Nominal
 from pmutools.formats.columns import FrameValues
 from pmutools.formats.files import END_NS
-from pmutools.formats.rows import Rows, idcodes_of, qualities_of, stamp_code, table_source
+from pmutools.formats.rows import NO_IDCODE, Rows, idcodes_of, qualities_of, stamp_code, table_source
 from pmutools.formats.source import BLOCK_FRAMES, TableSource
 from pmutools.formats.table_rows import CONFIG_KEY, LONG_COLUMNS
 
@@ -70,7 +70,7 @@ def arrow_source(
         raise SourceError(f"{path} has no column time_ns or time; is it a table of measurements?")
     counts = Counter[str]() if defects is None else defects
     own = _config_in(schema.metadata or {}, path)
-    rows = _rows(parts, counts)
+    rows = _rows(parts, counts, own.idcode if own else NO_IDCODE)
     return table_source(path, kind, names, rows, own=own, configs=configs, defects=counts, nominal=nominal)
 
 
@@ -83,7 +83,7 @@ def _config_in(metadata: dict[bytes, bytes], path: Path) -> StreamConfig | None:
         raise SourceError(f"{path}: metadata {CONFIG_KEY.decode()} is no configuration frame: {error}") from None
 
 
-def _rows(parts: Iterable[Any], defects: Counter[str]) -> Iterator[Rows]:
+def _rows(parts: Iterable[Any], defects: Counter[str], idcode: int) -> Iterator[Rows]:
     import pyarrow as pa
 
     for part in parts:
@@ -93,16 +93,16 @@ def _rows(parts: Iterable[Any], defects: Counter[str]) -> Iterator[Rows]:
             defects["damaged rows"] += part.num_rows
             continue
         for first in range(0, part.num_rows, BLOCK_FRAMES):
-            rows = _Part(part.slice(first, BLOCK_FRAMES)).rows(defects)
+            rows = _Part(part.slice(first, BLOCK_FRAMES), idcode).rows(defects)
             if len(rows.idcode):
                 yield rows
 
 
 class _Part:
-    """Some rows of an Arrow table."""
+    """Some rows of an Arrow table; ``idcode`` is theirs where they do not say it."""
 
-    def __init__(self, part: Any) -> None:
-        self.part = part
+    def __init__(self, part: Any, idcode: int) -> None:
+        self.part, self.idcode = part, idcode
         self.names = set(part.schema.names)
 
     def rows(self, defects: Counter[str]) -> Rows:
@@ -110,12 +110,12 @@ class _Part:
         good = (time_ns >= 0) & (time_ns < END_NS)
         if not good.all():
             defects["rows without a time"] += int(np.count_nonzero(~good))
-            return _Part(self.part.filter(_array(good))).rows(defects)
+            return _Part(self.part.filter(_array(good)), self.idcode).rows(defects)
         count = len(time_ns)
         arrivals = self._integers("arrival_ns") if "arrival_ns" in self.names else np.full(count, NO_TIME)
         return Rows(
             FrameValues(time_ns, arrivals, self._stamp_sources(), qualities_of(self.values("time_quality"), count)),
-            idcodes_of(self.values("idcode"), count),
+            idcodes_of(self.values("idcode"), count, self.idcode),
             self.values,
         )
 
