@@ -140,6 +140,39 @@ seconds_ns = duration_ns(NS)
 milliseconds_ns = duration_ns(NS // 1000)
 
 
+_SPANS_NS = {"ms": NS // 1000, "s": NS, "min": 60 * NS, "h": 3600 * NS, "d": 86400 * NS}
+_SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
+_MEASURE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
+
+
+def span_ns(text: str) -> int:
+    """A span of time with its unit (``10s``, ``1.5min``, ``1h``) as nanoseconds, more than 0."""
+    return _measured(text, _SPANS_NS, "a span of time; write as in 10s or 1.5h")
+
+
+def size_bytes(text: str) -> int:
+    """A size with its unit (``100MB``, ``1GiB``) as bytes, more than 0."""
+    return _measured(text, _SIZES, "a size; write as in 100MB or 1GiB")
+
+
+def span_or_size(text: str) -> tuple[int | None, int | None]:
+    """:func:`span_ns` or :func:`size_bytes`, by the unit; the other is None."""
+    match = _MEASURE.fullmatch(text.strip())
+    if match is not None and match[2].lower() in {unit.lower() for unit in _SIZES}:
+        return None, size_bytes(text)
+    return span_ns(text), None
+
+
+def _measured(text: str, units: Mapping[str, int], what: str) -> int:
+    match = _MEASURE.fullmatch(text.strip())
+    factor = None if match is None else {unit.lower(): each for unit, each in units.items()}.get(match[2].lower())
+    if match is None or factor is None:
+        raise ValueError(f"{text!r} is not {what} (units: {', '.join(units)})")
+    if not (value := round(Decimal(match[1]) * factor)):
+        raise ValueError(f"{text} is nothing; it must be more")
+    return value
+
+
 class Place(NamedTuple):
     """A time in a recording: ns into it (``relative``), or POSIX UTC.
 

@@ -168,7 +168,7 @@ def test_several_addresses_become_a_folder_of_tables(tmp_path: Path) -> None:
             send(port, [message.frame.data for message in recording(config, 20 + number)])
         result = ended(reader)
     assert result.code == 0, result.err
-    assert result.json["streams"] == len(ports)
+    assert [each["frames"] for each in result.json["streams"]] == [20 + k for k in range(len(ports))]
     written = sorted(Path(path) for path in result.json["paths"])
     assert [path.name for path in written] == [f"PMU{k}-{10 + k}.csv" for k in range(len(ports))]
     assert {path.parent for path in written} == {tmp_path / "logs"}
