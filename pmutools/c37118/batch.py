@@ -79,6 +79,20 @@ class Batch:
             yield Data(self.config, layout.unpacker.unpack_from(raw, at))
 
 
+def joined(batches: Sequence[Batch]) -> Batch:
+    """Batches of one configuration, one after the other. Wire bytes are kept where all have them."""
+    if len(batches) == 1:
+        return batches[0]
+    columns = {
+        f.name: np.concatenate([getattr(batch, f.name) for batch in batches])
+        for f in fields(Batch)
+        if f.name not in ("config", "wire")
+    }
+    config = batches[0].config
+    wires = [batch.wire.tobytes() for batch in batches if batch.wire is not None]
+    return Batch(config, wire=wire_view(b"".join(wires), config) if len(wires) == len(batches) else None, **columns)
+
+
 def wire_view(frames: bytes, config: StreamConfig) -> npt.NDArray[np.void]:
     """Data frames laid end to end, as a read-only structured array (N,) that shares their memory.
 

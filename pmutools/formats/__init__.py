@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMATS", "UNSAID", "FileFormat", "Nominal", "Sink", "SinkOptions", "open_sink", "open_source"]
 
+JOURNAL = ".journal"
+"""What follows the name of a recording while it is not finished, where it needs an end: its frames."""
 COMPRESSIONS = (".gz", ".zst")
 _COMPRESSED = (b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 
@@ -34,7 +36,7 @@ class FileFormat(NamedTuple):
     """One kind of file: its suffixes, its module, the bytes it may begin with, and whether it may be compressed.
 
     ``inferred`` says that its configuration may have to be inferred, ``tabular`` that it is made of columns,
-    ``streamed`` that it may go to standard output.
+    ``streamed`` that it may go to standard output, ``end_needed`` that it cannot be read before it is finished.
     """
 
     kind: str
@@ -46,6 +48,7 @@ class FileFormat(NamedTuple):
     inferred: bool = False
     tabular: bool = False
     streamed: bool = False
+    end_needed: bool = False
 
 
 class Nominal(NamedTuple):
@@ -74,11 +77,12 @@ FORMATS = (
     FileFormat("pcap", (".pcap",), "pcap", _PCAP_MAGICS, compressible=True, streamed=True),
     FileFormat("pcapng", (".pcapng",), "pcap", (b"\n\r\r\n",), compressible=True, streamed=True),
     FileFormat("mcap", (".mcap",), "mcap", (b"\x89MCAP0\r\n",)),
-    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",), inferred=True, tabular=True),
+    FileFormat("parquet", (".parquet",), "parquet", (b"PAR1",), inferred=True, tabular=True, end_needed=True),
     FileFormat("arrow", (".arrow",), "arrow", (b"ARROW1",), inferred=True, tabular=True, streamed=True),
     FileFormat("raw", (".c37118", ".pmucapture"), "raw", _FRAME_MAGICS, compressible=True, streamed=True),
     FileFormat("csv", (".csv",), "csv", compressible=True, inferred=True, tabular=True, streamed=True),
     FileFormat("jsonl", (".jsonl",), "jsonl", compressible=True, inferred=True, streamed=True),
+    FileFormat("journal", (".journal",), "journal", written=False),
     FileFormat("comtrade", (".cfg", ".dat", ".cff"), "comtrade", written=False, inferred=True),
 )
 
@@ -109,6 +113,7 @@ def open_source(
         raise SettingsError(f"nominal frequency {fnom_hz:g} Hz: C37.118 knows 50 and 60")
     if path.is_dir():
         return _open_folder(path, configs, nominal)
+    path = _readable(path)
     head, compressed = _head(path)
     form = _by_content(head) or _by_suffix(path)
     if form is None:
@@ -135,7 +140,8 @@ def open_sink(
 ) -> Sink:
     """Begin a recording whose format is told by its suffix; ``-`` is standard output, as CSV unless ``form`` is given.
 
-    ``form`` is a kind of :data:`FORMATS`; the other arguments are those of :class:`SinkOptions`.
+    ``form`` is a kind of :data:`FORMATS`. With ``journal`` there is a journal beside a recording that cannot be read
+    before it is finished. The other arguments are those of :class:`SinkOptions`.
 
     Raises
     ------
@@ -162,13 +168,18 @@ def open_sink(
         )
     if long and per_stream:
         raise SettingsError("long form is one file of all streams, and none a stream; choose one")
-    options = SinkOptions(phasors, long, fields, per_stream, name, journal, found.suffixes[0])
+    options = SinkOptions(phasors, long, fields, per_stream, name, found.suffixes[0])
     create = import_module(f"{__name__}.{found.module}").create
     if per_stream and not found.tabular:
         from pmutools.formats.per_stream import PerStreamSink
 
         return PerStreamSink(path, suffix_of(path), create, options)
-    return cast("Sink", create(path, options))
+    sink = cast("Sink", create(path, options))
+    if journal and found.end_needed:
+        from pmutools.formats.journal import JournalledSink
+
+        return JournalledSink(sink, path)
+    return sink
 
 
 def _streamed(form: str) -> FileFormat:
@@ -218,11 +229,35 @@ def _head(path: Path) -> tuple[bytes, bool]:
             return window.data[:16], file.read(4).startswith(_COMPRESSED)
 
 
+def _readable(path: Path) -> Path:
+    """``path``, or what stands for it where it was never finished. Raises SourceError where that is a folder's."""
+    if not _is_unfinished(path):
+        return path
+    journal = path.with_name(path.name + JOURNAL)
+    if journal.is_file():
+        return journal
+    if others := sorted(path.parent.glob(f"*{JOURNAL}")):
+        raise SourceError(f"{path} was never finished; its frames are in {others[0]}")
+    return path
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Whether a file lacks the end that its format needs."""
+    form = _by_suffix(path)
+    if form is None or not form.end_needed or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 4))
+        return file.read(4) not in form.magics
+
+
 def _open_folder(path: Path, configs: Iterable[StreamConfig], nominal: Nominal) -> Source:
     from pmutools.formats.folder import MergedSource
 
     known = tuple(configs)
     files = sorted(file for file in path.iterdir() if file.is_file() and _by_suffix(file) and not _is_second(file))
+    if any(file.suffix == JOURNAL for file in files):  # it has what unfinished files have
+        files = [file for file in files if not _is_unfinished(file)]
     if not files:
         raise SourceError(f"{path} is a folder without recordings; name a file, or a folder of {known_suffixes()}")
     sources = [open_source(file, configs=known, data_rate=nominal.data_rate, fnom_hz=nominal.fnom_hz) for file in files]

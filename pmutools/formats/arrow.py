@@ -22,15 +22,9 @@ _FRAME = 8
 
 def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a table, one record batch in memory at a time."""
-    return read_rows(path, "arrow", configs, nominal, Counter())
-
-
-def read_rows(
-    path: Path, kind: str, configs: Iterable[StreamConfig], nominal: Nominal, defects: Counter[str]
-) -> TableSource:
-    """:func:`read`, of a file that stands for another of another ``kind``."""
     import pyarrow as pa
 
+    defects = Counter[str]()
     with reading(path, "Arrow"):
         file = pa.OSFile(str(path))
         file.seek(_FRAME if file.read(len(MAGIC)) == MAGIC else 0)
@@ -43,7 +37,7 @@ def read_rows(
                 except (OSError, ValueError, pa.ArrowException):
                     defects["table without an end"] = 1
 
-        return arrow_source(path, kind, stream.schema, parts(), configs, defects, nominal)
+        return arrow_source(path, "arrow", stream.schema, parts(), configs, defects, nominal)
 
 
 class ArrowRows(TableWriter):

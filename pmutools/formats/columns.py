@@ -64,7 +64,7 @@ class FrameValues(NamedTuple):
     time_quality: npt.NDArray[np.uint8]
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=8192)
 def columns_of(config: StreamConfig, phasors: Phasors) -> tuple[Column, ...]:
     """The columns of ``config``'s stations in the order of the frame, with unique names."""
     at = Counter[str]()
@@ -113,7 +113,7 @@ def quantities(batch: Batch, phasors: Phasors, wanted: Collection[str]) -> dict[
 
 def _polar(batch: Batch) -> tuple[Floats, Floats]:
     """Magnitudes and angles (N, P)."""
-    if batch.wire is not None and all(station.format & Format.POLAR for station in batch.config.stations):
+    if batch.wire is not None and _is_polar(batch.config):
         magnitude, degrees = np.empty(batch.phasors.shape), np.empty(batch.phasors.shape)
     else:
         magnitude, degrees = np.abs(batch.phasors), np.degrees(np.angle(batch.phasors))
@@ -122,8 +122,19 @@ def _polar(batch: Batch) -> tuple[Floats, Floats]:
     return magnitude, degrees
 
 
-def _polar_stations(config: StreamConfig) -> Iterable[tuple[str, slice, Floats, Floats]]:
+@lru_cache(maxsize=8192)
+def _is_polar(config: StreamConfig) -> bool:
+    """Whether all stations send polar phasors."""
+    return all(station.format & Format.POLAR for station in config.stations)
+
+
+@lru_cache(maxsize=8192)
+def _polar_stations(config: StreamConfig) -> tuple[tuple[str, slice, Floats, Floats], ...]:
     """dtype field, phasor columns, factors and angle offsets (rad) of the stations that send polar phasors."""
+    return tuple(_found_polar(config))
+
+
+def _found_polar(config: StreamConfig) -> Iterable[tuple[str, slice, Floats, Floats]]:
     layout = layout_of(config)
     for number, (station, slots) in enumerate(zip(config.stations, layout.slots, strict=True)):
         if station.format & Format.POLAR and station.phasors:
@@ -226,7 +237,7 @@ def _present(config: StreamConfig, frequency: Floats, phasors: npt.NDArray[np.co
 def _with_polar_wire(batch: Batch, magnitude: Floats, degrees: Floats) -> Batch:
     """``batch`` with frames whose polar phasors come from the columns themselves, where there are such stations."""
     config = batch.config
-    stations = list(_polar_stations(config))
+    stations = _polar_stations(config)
     if not stations or not len(batch):
         return batch
     octets, _ = encode_batch(batch)

@@ -31,8 +31,6 @@ from pmutools.formats.source import TableSource
 from pmutools.formats.table_rows import LONG_COLUMNS
 from pmutools.formats.table_sink import TableSink, TableWriter
 
-TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
-
 
 def read(path: Path, configs: Iterable[StreamConfig] = (), nominal: Nominal = UNSAID) -> TableSource:
     """Open a CSV of either layout. Raises SourceError where its header or first rows say that it is neither."""
@@ -114,9 +112,10 @@ def _cells(name: str, column: Any) -> Any:
     import pyarrow.compute as pc
 
     if name == "time_ns":
-        return pc.strftime(column.cast(pa.timestamp("ns")), TIME_FORMAT)
+        return pa.array(np.datetime_as_string(column.to_numpy().view("datetime64[ns]"), timezone="UTC"))
     if pa.types.is_floating(column.type):
-        return pc.if_else(pc.is_nan(column), pa.scalar(None, column.type), column)
+        absent = np.isnan(column.to_numpy(zero_copy_only=False))
+        return pc.if_else(pa.array(absent), pa.scalar(None, column.type), column) if absent.any() else column
     return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
 
 

@@ -32,8 +32,6 @@ class SinkOptions(NamedTuple):
     """One file a stream in a folder, from the first stream on."""
     name: Namer = stream_name
     """What a stream's file is called there."""
-    journal: bool = False
-    """Readable up to the last flush before it is finished, also where the format is not by itself."""
     suffix: str = ""
     """The suffix of what goes to standard output."""
 

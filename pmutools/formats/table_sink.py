@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-from pmutools.c37118.batch import Batch
+from pmutools.c37118.batch import Batch, joined
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
 from pmutools.errors import SourceError
@@ -19,7 +19,9 @@ from pmutools.formats.source import BLOCK_FRAMES, Block
 from pmutools.formats.table_rows import LongRows, has_columns, wide_rows, wide_schema
 
 HELD_BYTES = 256 << 20
-"""What all tables together hold in memory between two flushes, before it is written though it makes small groups."""
+"""What all tables together hold in memory after a flush, about, before it is written though it makes small groups."""
+GATHERED_FRAMES = 256
+"""Frames of a stream that become rows at once, where they need not be on the disk before."""
 
 
 class TableWriter:
@@ -27,6 +29,8 @@ class TableWriter:
 
     packed = False
     """Whether names may come dictionary-encoded, by dictionaries that grow."""
+    at_once = True
+    """Whether what is written can be read after a flush; if not, nothing is gained by small pieces."""
     held_bytes = 0
     """What is in memory only."""
 
@@ -39,19 +43,50 @@ class TableWriter:
     def close(self) -> None:
         raise NotImplementedError
 
-    def flush(self) -> None:
-        """Make readable what the file itself does not; it is flushed by then."""
-
     def spill(self) -> None:
         """Write what is held in memory."""
 
-    def moved(self) -> None:
-        """The file has another name now."""
 
+class _Table:
+    """One table being written; batches are gathered, to be made rows together."""
 
-class _Table(NamedTuple):
-    file: OutputFile
-    writer: TableWriter
+    def __init__(
+        self, file: OutputFile, writer: TableWriter, to_rows: Callable[[Sequence[Batch]], Any], frames: int
+    ) -> None:
+        self.file, self._writer = file, writer
+        self._to_rows, self._limit = to_rows, frames
+        self._batches: list[Batch] = []
+        self._frames = 0
+
+    @property
+    def held_bytes(self) -> int:
+        """About."""
+        gathered = self._frames * self._batches[0].config.frame_size * 6 if self._batches else 0
+        return self._writer.held_bytes + gathered
+
+    def add(self, batch: Batch) -> None:
+        self._batches.append(batch)
+        self._frames += len(batch)
+        if self._frames >= self._limit:
+            self._make_rows()
+
+    def flush(self) -> None:
+        if self._writer.at_once:
+            self._make_rows()
+        self.file.flush()
+
+    def spill(self) -> None:
+        self._make_rows()
+        self._writer.spill()
+
+    def finish(self) -> None:
+        self._make_rows()
+        self._writer.close()
+
+    def _make_rows(self) -> None:
+        batches, self._batches, self._frames = self._batches, [], 0
+        if batches:
+            self._writer.write(self._to_rows(batches))
 
 
 class TableSink:
@@ -69,13 +104,10 @@ class TableSink:
         self._path, self._writer, self._options = path, writer, options
         self._names = FileNames(suffix)
         self._tables: list[_Table] = []
-        self._by_stream: dict[tuple[Flow, StreamConfig], TableWriter] = {}
+        self._by_stream: dict[tuple[Flow, StreamConfig] | None, _Table] = {}
         self._first_name = ""
         self._folder = folder_for(path, suffix) if options.per_stream else None
         self._first_file = OutputFile(path) if self._folder is None else None
-        self._long = LongRows(options.phasors, options.fields, packed=writer.packed) if options.long else None
-        self._gathered: list[Batch] = []
-        self._gathered_frames = 0
         self._closed = False
 
     @property
@@ -89,27 +121,19 @@ class TableSink:
         options = self._options
         if options.fields is not None and not has_columns(batch.config, options.phasors, options.fields):
             return
-        if self._long is not None:
-            self._gathered.append(batch)
-            self._gathered_frames += len(batch)
-            if self._gathered_frames >= BLOCK_FRAMES:
-                self._write_gathered()
-            return
-        key = flow._replace(connection=0), batch.config
-        writer = self._by_stream.get(key)
-        if writer is None:
-            schema = wide_schema(batch.config, options.phasors, options.fields)
-            writer = self._by_stream[key] = self._begin(self._next_file(flow, batch.config), schema)
-        writer.write(wide_rows(batch, options.phasors, options.fields))
+        key = None if options.long else (flow._replace(connection=0), batch.config)
+        table = self._by_stream.get(key)
+        if table is None:
+            table = self._by_stream[key] = self._begin(flow, batch.config)
+            self._tables.append(table)
+        table.add(batch)
 
     def flush(self) -> None:
-        self._write_gathered()
-        if sum(table.writer.held_bytes for table in self._tables) > HELD_BYTES:
+        for table in self._tables:
+            table.flush()
+        if sum(table.held_bytes for table in self._tables) > HELD_BYTES:
             for table in self._tables:
-                table.writer.spill()
-        for file, writer in self._tables:
-            file.flush()
-            writer.flush()
+                table.spill()
 
     def close(self) -> None:
         """Finish all tables; where there are none, the file or folder that was made for the first is taken away."""
@@ -117,7 +141,7 @@ class TableSink:
             return
         self._closed = True
         failures: list[SourceError] = []
-        for step in self._last_steps():
+        for step in (*(table.finish for table in self._tables), *(table.file.close for table in self._tables)):
             try:
                 step()
             except SourceError as error:
@@ -135,24 +159,18 @@ class TableSink:
     ) -> None:
         self.close()
 
-    def _last_steps(self) -> Iterator[Callable[[], None]]:
-        yield self._write_gathered
-        yield from (table.writer.close for table in self._tables)
-        yield from (table.file.close for table in self._tables)
+    def _begin(self, flow: Flow, config: StreamConfig) -> _Table:
+        phasors, long, fields = self._options.phasors, self._options.long, self._options.fields
+        file = self._next_file(flow, config)
+        if long:
+            form = LongRows(phasors, fields, packed=self._writer.packed)
+            return _Table(file, self._writer(file, form.schema, self._options), form.rows, BLOCK_FRAMES)
 
-    def _write_gathered(self) -> None:
-        batches, self._gathered, self._gathered_frames = self._gathered, [], 0
-        if not batches or self._long is None:
-            return
-        if not self._tables:
-            assert self._first_file is not None
-            self._begin(self._first_file, self._long.schema)
-        self._tables[0].writer.write(self._long.rows(batches))
+        def to_rows(batches: Sequence[Batch]) -> Any:
+            return wide_rows(joined(batches), phasors, fields)
 
-    def _begin(self, file: OutputFile, schema: Any) -> TableWriter:
-        table = _Table(file, self._writer(file, schema, self._options))
-        self._tables.append(table)
-        return table.writer
+        writer = self._writer(file, wide_schema(config, phasors, fields), self._options)
+        return _Table(file, writer, to_rows, BLOCK_FRAMES if writer.at_once else GATHERED_FRAMES)
 
     def _next_file(self, flow: Flow, config: StreamConfig) -> OutputFile:
         """The file of a new table: OUT for the first; with the second, OUT moves into the folder."""
@@ -164,9 +182,7 @@ class TableSink:
             raise SourceError("several streams cannot share standard output as tables; name a file, or use --long")
         if self._folder is None:
             self._folder = folder_for(self._path, self._names.suffix)
-            first = self._tables[0]
-            first.file.move(self._folder / self._first_name)
-            first.writer.moved()
+            self._tables[0].file.move(self._folder / self._first_name)
         return OutputFile(self._folder / name)
 
     def _take_away(self) -> None:
