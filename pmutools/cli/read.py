@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import click
 
 from pmutools import parsers
-from pmutools.cli.shell import Exit, Parsed, Talk, common, interruptible
+from pmutools.cli.read_hands import triggered_by_hand
+from pmutools.cli.read_report import list_fields, report
+from pmutools.cli.shell import Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION
 from pmutools.errors import SettingsError
 from pmutools.timebase import NS
@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from pmutools.tools.reader.run import Observer
 
 FORMS = ("csv", "jsonl", "arrow", "raw", "pcapng", "pcap")
-SHOWN_PATHS = 4
 MANY_TABLES = 64
-"""Streams beside each other as tables, above which one table in long form is recommended."""
+"""Tables side by side, above which one in long form is recommended."""
 RING_NS, AFTER_NS = 60 * NS, 10 * NS
 
 
@@ -61,7 +60,9 @@ if TYPE_CHECKING:
 @click.option(
     "--fields", type=Parsed(_fields), metavar="LIST", help="Columns of tables, in this order: time,*.freq_hz,N1.V1.*"
 )
-@click.option("--list-fields", is_flag=True, help="Print the columns that there are, with their units, and end.")
+@click.option(
+    "--list-fields", "listing", is_flag=True, help="Print the columns that there are, with their units, and end."
+)
 @click.option("--phasors", type=click.Choice(("polar", "rect")), default="polar", show_default=True)
 @click.option("--long", "long_form", is_flag=True, help="Tables in long form, all streams in one file.")
 @click.option("--per-stream", is_flag=True, help="A folder with one file a stream.")
@@ -106,7 +107,7 @@ def command(
     out: str | None,
     form: str | None,
     fields: Any,
-    list_fields: bool,
+    listing: bool,
     phasors: str,
     long_form: bool,
     per_stream: bool,
@@ -127,7 +128,7 @@ def command(
     """
     from pmutools.tools.live import LiveSource
 
-    if not (out or list_fields):
+    if not (out or listing):
         raise SettingsError("where to? give --out FILE, or --out - for standard output")
     if triggers is None and (ring_ns or after_ns):
         raise SettingsError("--ring and --after are for --trigger; add one, as in --trigger freq<59.95")
@@ -140,15 +141,15 @@ def command(
         from pmutools.tools.reader.ring import Window
 
         polar: Literal["polar", "rect"] = "rect" if phasors == "rect" else "polar"
-        if list_fields:
-            return _list_fields(source, polar, talk, as_json)
+        if listing:
+            return list_fields(source, polar, talk, as_json)
         window = Window(ring_ns or RING_NS, after_ns or AFTER_NS)
         recording = Recording(
             cast("str", out), form, polar, long_form, fields, per_stream, split, keep, triggers or (), window
         )
         reading, recorder = _read(source, recording, talk, stack)
         stopped = stop()
-    return _report(source, recording, reading, recorder, talk, as_json=as_json, stopped=stopped)
+    return report(source, recording, reading, recorder, talk, as_json=as_json, stopped=stopped)
 
 
 def _endpoints(urls: Sequence[str], ini: str | None) -> list[Any]:
@@ -193,7 +194,8 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
         check = FieldCheck(recording.fields, recording.phasors, Known(source), herald.say)
         observers.append(check)
     if isinstance(recorder, Ring):
-        observers += _triggered_by_hand(recorder, recording, talk, stack)
+        observers += triggered_by_hand(recorder, [each.text for each in recording.triggers], talk, stack)
+    many = False
     soon = recording.to_stdout or isinstance(recorder, Ring)
 
     def observe(found: Any) -> None:
@@ -201,7 +203,13 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
             each(found)
 
     def progress(now: Reading) -> None:
+        nonlocal many
         herald.progress(lambda: f"{now.frames} frames, {len(now.streams)} streams")
+        if not (many or recording.per_stream) and len(recorder.paths) > MANY_TABLES:
+            many = True
+            herald.say(
+                f"more than {MANY_TABLES} tables side by side: --long writes all streams into one, for less work"
+            )
 
     reading = read(
         source,
@@ -210,120 +218,9 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
         observe=observe,
         round_ns=ROUND_NS if soon else FLUSH_NS,
         flush_ns=0 if recording.to_stdout else FLUSH_NS,
+        threaded=True,
     )
     if check is not None and reading.frames:
         for item in check.unmatched:
             talk.say(f"--fields: {item!r} has fitted no column of the streams that came")
     return reading, recorder
-
-
-def _triggered_by_hand(ring: Any, recording: Recording, talk: Talk, stack: ExitStack) -> list[Observer]:
-    """Connect the signal and the keyboard, where they are among the triggers."""
-    kinds = {condition.text for condition in recording.triggers}
-    if "signal" in kinds:
-        _on_signal(lambda: ring.fire("signal"), talk)
-    if "key" not in kinds:
-        return []
-    pressed = stack.enter_context(_keyboard())
-    talk.say("any key records")
-    return [lambda found: ring.fire("key") if pressed() else None]
-
-
-def _on_signal(fire: Callable[[], object], talk: Talk) -> None:
-    import os
-    import signal
-
-    if not hasattr(signal, "SIGUSR1"):
-        raise SettingsError("this system has no SIGUSR1; use --trigger key")
-    signal.signal(signal.SIGUSR1, lambda number, frame: fire())
-    talk.say(f"kill -USR1 {os.getpid()} records")
-
-
-@contextmanager
-def _keyboard() -> Iterator[Callable[[], bool]]:
-    """Whether a key was pressed since the last look. Raises SettingsError where there is no terminal."""
-    import os
-    import select
-    import sys
-
-    if sys.platform == "win32" or not sys.stdin.isatty():
-        raise SettingsError("--trigger key: standard input is no terminal; use --trigger signal")
-    import termios
-    import tty
-
-    terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)
-    try:
-        yield lambda: bool(select.select([terminal], [], [], 0)[0] and os.read(terminal, 1 << 10))
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
-
-
-def _list_fields(source: LiveSource, phasors: Literal["polar", "rect"], talk: Talk, as_json: bool) -> int:
-    """Print the columns of all streams once they are known, or at the end."""
-    from pmutools.formats.columns import FRAME_COLUMNS
-    from pmutools.tools.live import ROUND_NS
-    from pmutools.tools.reader.known import Known
-
-    known = Known(source)
-    for found in source.rounds(ROUND_NS):
-        known.see(found)
-        if known.settled:
-            break
-    if not known.configs:
-        raise _nothing(source)
-    units = dict.fromkeys(FRAME_COLUMNS, "") | {"time_ns": "ns", "arrival_ns": "ns"}
-    units |= {name: column.unit for name, column in known.columns(phasors).items()}
-    if as_json:
-        click.echo(json.dumps([{"name": name, "unit": unit or None} for name, unit in units.items()]))
-    else:
-        for name, unit in units.items():
-            click.echo(f"{name}\t{unit}" if unit else name)
-    talk.say(f"{len(units)} columns of {len(known.configs)} streams")
-    return Exit.DONE
-
-
-def _report(
-    source: LiveSource,
-    recording: Recording,
-    reading: Reading,
-    recorder: Recorder,
-    talk: Talk,
-    *,
-    as_json: bool,
-    stopped: bool,
-) -> int:
-    paths = [str(path) for path in recorder.paths]
-    if as_json and not recording.to_stdout:
-        click.echo(json.dumps(reading.to_json() | {"paths": paths}))
-    talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
-    for reason, nbytes in reading.skipped.items():
-        talk.say(f"  {nbytes} bytes skipped: {reason}")
-    if reading.own_drops:
-        talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
-    if stopped:
-        return Exit.INTERRUPTED
-    if not reading.frames and not reading.skipped:
-        raise _nothing(source)
-    return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
-
-
-def _paths_text(paths: Sequence[str]) -> str:
-    if not paths:
-        return "nothing written"
-    if len(paths) <= SHOWN_PATHS:
-        return ", ".join(paths)
-    folders = sorted({str(Path(path).parent) for path in paths})
-    return f"{len(paths)} files in {', '.join(folders[:SHOWN_PATHS])}{' ...' if len(folders) > SHOWN_PATHS else ''}"
-
-
-def _nothing(source: LiveSource) -> Exception:
-    from pmutools.errors import SourceError
-
-    endpoints = [str(endpoint) for endpoint in source.receivers.endpoints]
-    named = ", ".join(endpoints[:SHOWN_PATHS]) + (" ..." if len(endpoints) > SHOWN_PATHS else "")
-    return SourceError(
-        f"no data came from {named}; is the sender on, and the port right? "
-        "A device answers to its own IDCODE only: name it with ?idcode=N"
-    )

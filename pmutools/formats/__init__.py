@@ -163,9 +163,7 @@ def open_sink(
         raise SettingsError("several files cannot go to standard output; name a file")
     if (long or fields is not None) and not found.tabular:
         tables = ", ".join(each.suffixes[0] for each in FORMATS if each.tabular)
-        raise SettingsError(
-            f"{path}: {found.kind} holds whole frames; columns can be chosen, and long form had, of {tables}"
-        )
+        raise SettingsError(f"{path}: {found.kind} holds whole frames; fields and long form are for {tables}")
     if long and per_stream:
         raise SettingsError("long form is one file of all streams, and none a stream; choose one")
     options = SinkOptions(phasors, long, fields, per_stream, name, found.suffixes[0])
@@ -242,12 +240,12 @@ def _readable(path: Path) -> Path:
 
 
 def _is_unfinished(path: Path) -> bool:
-    """Whether a file lacks the end that its format needs."""
+    """Whether a file lacks the end that its format needs, which is its first bytes again."""
     form = _by_suffix(path)
     if form is None or not form.end_needed or not path.is_file():
         return False
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 4))
+        file.seek(max(4, path.stat().st_size - 4))  # the first four are the beginning's
         return file.read(4) not in form.magics
 
 

@@ -51,6 +51,7 @@ LOSSES = {
 CAPTURE = frozenset({"stamp source"})
 RAW = frozenset({"flow", "arrival", "stamp source"})
 TABLE = frozenset({"flow", "other frames", "repeats"})
+OBJECTS = frozenset({"other frames", "repeats", "bytes"})
 CASES = [
     *(Case(suffix, CAPTURE) for suffix in (".pcap", ".pcapng", ".pcap.gz", ".pcapng.zst")),
     *(Case(suffix, RAW) for suffix in (".c37118", ".PmuCapture", ".c37118.gz", ".c37118.zst")),
@@ -59,6 +60,10 @@ CASES = [
     *(Case(".parquet", TABLE | {"until closed"}, {"phasors": style}) for style in ("polar", "rect")),
     *(Case(".csv", TABLE | {"bytes"}, {"phasors": style}) for style in ("polar", "rect")),
     *(Case(suffix, TABLE | {"bytes"}) for suffix in (".csv.gz", ".csv.zst")),
+    *(
+        Case(suffix, frozenset({"other frames", "repeats", "bytes"}))
+        for suffix in (".jsonl", ".jsonl.gz", ".jsonl.zst")
+    ),
 ]
 every_format = pytest.mark.parametrize("case", CASES, ids=str)
 

@@ -11,6 +11,7 @@ from pmutools.formats.columns import Column, Phasors, columns_of
 from pmutools.formats.fields import Fields, no_such_column
 from pmutools.formats.source import Block
 from pmutools.formats.table_rows import has_columns, names_of
+from pmutools.parsers import NAMED_STREAMS
 from pmutools.timebase import NS
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.reading import Round
@@ -65,23 +66,31 @@ def _alone(source: LiveSource) -> bool:
 class FieldCheck:
     """Holds the fields wanted against the streams: an item that fits none of them is an error once all are known.
 
-    ``tell`` is given a line for each stream that is left out because it has none of the fields.
+    ``tell`` is given a line about streams that are left out because they have none of the fields.
     """
 
     def __init__(self, fields: Fields, phasors: Phasors, known: Known, tell: Callable[[str], None]) -> None:
         self._fields, self._phasors, self._known, self._tell = fields, phasors, known, tell
+        self._left_out: list[int] = []
         self._checked = False
 
     def __call__(self, found: Round) -> None:
         """Look at a round. Raises SettingsError, with the nearest columns there are."""
         for config in self._known.see(found):
             if not has_columns(config, self._phasors, self._fields):
-                self._tell(f"stream {config.idcode} has none of the fields wanted, and is left out")
-        if self._known.settled and not self._checked:
+                self._left_out.append(config.idcode)
+        if not self._known.settled:
+            return
+        if not self._checked:
             self._checked = True
             names = self._known.names(self._phasors)
             if unknown := self._fields.unknown(names):
                 raise SettingsError(f"--fields: {no_such_column(unknown[0], names)} (--list-fields prints all)")
+        if self._left_out:
+            more = " ..." if len(self._left_out) > NAMED_STREAMS else ""
+            streams = ", ".join(map(str, self._left_out[:NAMED_STREAMS])) + more
+            self._tell(f"left out, as they have none of the fields: streams {streams}")
+            self._left_out.clear()
 
     @property
     def unmatched(self) -> tuple[str, ...]:

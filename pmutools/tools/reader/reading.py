@@ -70,10 +70,6 @@ class Reading:
             elif item.frame.type is FrameType.DATA:  # pragma: no cover - rounds give data as blocks
                 raise TypeError("data frames come in blocks")
 
-    def flushed(self) -> None:
-        """All that was counted is safe."""
-        self.kept, self.kept_to_ns = self.frames, self.latest_ns
-
     def to_json(self) -> dict[str, Any]:
         return {
             "frames": self.frames,

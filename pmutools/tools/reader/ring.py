@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from operator import attrgetter
 from pathlib import Path
 
 from pmutools.clock import Clock
@@ -69,7 +71,7 @@ class Ring:
         self._history = History()
         self._files = Files(path.parent)
         self._event: _Event | None = None
-        self._asked: list[Fired] = []
+        self._asked = deque[Fired]()
         self._shortened = False
         self.events = 0
         """Recordings begun."""
@@ -79,7 +81,10 @@ class Ring:
         return self._files.paths + (self._event.log.paths if self._event is not None else [])
 
     def fire(self, kind: str) -> bool:
-        """Someone asks for a recording by ``signal`` or ``key``; it begins with the next round. False: not wanted."""
+        """Someone asks for a recording by ``signal`` or ``key``; it begins with the next round. False: not wanted.
+
+        May be called from another thread, or from a signal handler.
+        """
         fired = self._watch.manual(kind, self._clock.realtime_ns())
         if fired is not None:
             self._asked.append(fired)
@@ -89,9 +94,11 @@ class Ring:
         now_ns = self._clock.monotonic_ns()
         items = list(found)
         self._history.add(items, now_ns)
-        asked, self._asked = self._asked, []
-        for fired in [*asked, *self._watch.look(items, now_ns, self._clock.realtime_ns())]:
-            self._trigger(fired, now_ns)
+        fired = self._watch.look(items, now_ns, self._clock.realtime_ns())
+        while self._asked:
+            fired.append(self._asked.popleft())
+        for each in sorted(fired, key=attrgetter("time_ns")):
+            self._trigger(each, now_ns)
         event = self._event
         if event is not None and self._watch.holding:
             event.until_ns = max(event.until_ns, min(now_ns + self._window.after_ns, event.began_ns + EVENT_NS))

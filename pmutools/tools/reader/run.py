@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 
 from pmutools.c37118.demux import Loss, Message
 from pmutools.errors import SourceError
@@ -13,6 +14,7 @@ from pmutools.timebase import NS, format_utc
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.log import Log, Recorder
 from pmutools.tools.reader.reading import Reading
+from pmutools.tools.reader.steps import Direct, Threaded
 
 FLUSH_NS = NS
 """What a killed reader can lose at most: what came since."""
@@ -27,11 +29,13 @@ def read(
     observe: Observer | None = None,
     round_ns: int = FLUSH_NS,
     flush_ns: int = FLUSH_NS,
+    threaded: bool = False,
 ) -> Reading:
     """Read ``source`` to its end into ``into``, which is left open.
 
     ``observe`` is given every round before it is recorded, ``progress`` is called after each flush. Rounds and flushes
-    are about ``round_ns`` and ``flush_ns`` apart (0: after each round).
+    are about ``round_ns`` and ``flush_ns`` apart (0: after each round). ``threaded``: ``into`` is written in a thread
+    of its own, and ``progress`` does not wait for it.
 
     Raises
     ------
@@ -42,27 +46,43 @@ def read(
     recorder: Recorder = into if hasattr(into, "take") else Log(into)  # type: ignore[assignment]
     clock = source.clock
     due_ns = clock.monotonic_ns() + flush_ns
-    for found in source.rounds(round_ns):
-        reading.count(found)
-        reading.own_drops = source.own_drops
-        if observe is not None:
-            observe(found)
-        with _told(recorder, reading):
-            recorder.take(found)
-        now_ns = clock.monotonic_ns()
-        if now_ns + round_ns // 2 >= due_ns:  # the nearest round, not the next one
-            due_ns = now_ns + flush_ns
-            _flush(recorder, reading)
-            if progress is not None:
-                progress(reading)
-    _flush(recorder, reading)
+    with _told(recorder, reading), Threaded() if threaded else Direct() as steps:
+        for found in source.rounds(round_ns):
+            reading.count(found)
+            reading.own_drops = source.own_drops
+            if observe is not None:
+                observe(found)
+            steps.do(partial(_record, recorder.take, found), weight(found))
+            now_ns = clock.monotonic_ns()
+            if now_ns + round_ns // 2 >= due_ns:  # the nearest round, not the next one
+                due_ns = now_ns + flush_ns
+                steps.do(_flush(recorder, reading))
+                if progress is not None:
+                    progress(reading)
+        steps.do(_flush(recorder, reading))
     return reading
 
 
-def _flush(recorder: Recorder, reading: Reading) -> None:
-    with _told(recorder, reading):
-        recorder.flush()
-    reading.flushed()
+class _Refused(Exception):
+    """The recording cannot be written, for the reason in ``__cause__``."""
+
+
+def _record(step: Callable[..., None], *given: object) -> None:
+    try:
+        step(*given)
+    except SourceError as error:
+        raise _Refused from error
+
+
+def _flush(recorder: Recorder, reading: Reading) -> Callable[[], None]:
+    """A flush, after which all that has been counted by now is safe."""
+    frames, latest_ns = reading.frames, reading.latest_ns
+
+    def step() -> None:
+        _record(recorder.flush)
+        reading.kept, reading.kept_to_ns = frames, latest_ns
+
+    return step
 
 
 @contextmanager
@@ -70,10 +90,15 @@ def _told(recorder: Recorder, reading: Reading) -> Iterator[None]:
     """Where writing fails: keep what can be kept, and say what is lost."""
     try:
         yield
-    except SourceError as error:
+    except _Refused as refused:
         with suppress(SourceError):
             recorder.close()
-        raise SourceError(f"{error}; {_fate(reading)}") from None
+        raise SourceError(f"{refused.__cause__}; {_fate(reading)}") from None
+
+
+def weight(found: Sequence[Block | Message | Loss]) -> int:
+    """Bytes that a round takes in memory, about: its columns are some times its frames."""
+    return sum(6 * len(item.batch) * item.batch.config.frame_size for item in found if isinstance(item, Block))
 
 
 def _fate(reading: Reading) -> str:

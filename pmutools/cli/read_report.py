@@ -1,0 +1,89 @@
+"""What ``pmu read`` prints: the columns that there are, and what was read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from pmutools.cli.shell import Exit, Talk
+from pmutools.errors import SourceError
+
+if TYPE_CHECKING:
+    from pmutools.tools.live import LiveSource
+    from pmutools.tools.reader import Reading
+    from pmutools.tools.reader.log import Recorder
+    from pmutools.tools.reader.recorder import Recording
+
+SHOWN_PATHS = 4
+
+
+def list_fields(source: LiveSource, phasors: Literal["polar", "rect"], talk: Talk, as_json: bool) -> int:
+    """Print the columns of all streams once they are known, or at the end."""
+    from pmutools.formats.columns import FRAME_COLUMNS
+    from pmutools.tools.live import ROUND_NS
+    from pmutools.tools.reader.known import Known
+
+    known = Known(source)
+    for found in source.rounds(ROUND_NS):
+        known.see(found)
+        if known.settled:
+            break
+    if not known.configs:
+        raise nothing_came(source)
+    units = dict.fromkeys(FRAME_COLUMNS, "") | {"time_ns": "ns", "arrival_ns": "ns"}
+    units |= {name: column.unit for name, column in known.columns(phasors).items()}
+    if as_json:
+        click.echo(json.dumps([{"name": name, "unit": unit or None} for name, unit in units.items()]))
+    else:
+        for name, unit in units.items():
+            click.echo(f"{name}\t{unit}" if unit else name)
+    talk.say(f"{len(units)} columns of {len(known.configs)} streams")
+    return Exit.DONE
+
+
+def report(
+    source: LiveSource,
+    recording: Recording,
+    reading: Reading,
+    recorder: Recorder,
+    talk: Talk,
+    *,
+    as_json: bool,
+    stopped: bool,
+) -> int:
+    paths = [str(path) for path in recorder.paths]
+    if as_json and not recording.to_stdout:
+        click.echo(json.dumps(reading.to_json() | {"paths": paths}))
+    talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
+    for reason, nbytes in reading.skipped.items():
+        talk.say(f"  {nbytes} bytes skipped: {reason}")
+    if reading.own_drops:
+        talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
+    if stopped:
+        return Exit.INTERRUPTED
+    if not reading.frames and not reading.skipped:
+        raise nothing_came(source)
+    return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
+
+
+def _paths_text(paths: Sequence[str]) -> str:
+    if not paths:
+        return "nothing written"
+    if len(paths) <= SHOWN_PATHS:
+        return ", ".join(paths)
+    folders = sorted({str(Path(path).parent) for path in paths})
+    return f"{len(paths)} files in {', '.join(folders[:SHOWN_PATHS])}{' ...' if len(folders) > SHOWN_PATHS else ''}"
+
+
+def nothing_came(source: LiveSource) -> SourceError:
+    """The error of a reader that heard nothing at all."""
+    endpoints = [str(endpoint) for endpoint in source.receivers.endpoints]
+    named = ", ".join(endpoints[:SHOWN_PATHS]) + (" ..." if len(endpoints) > SHOWN_PATHS else "")
+    return SourceError(
+        f"no data came from {named}; is the sender on, and the port right? "
+        "A device answers to its own IDCODE only: name it with ?idcode=N"
+    )
