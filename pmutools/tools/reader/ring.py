@@ -28,7 +28,7 @@ EVENT_NS = 600 * NS
 
 @dataclass(frozen=True)
 class Window:
-    """What is recorded of an event."""
+    """What is recorded of an event: at least this, and up to a round more."""
 
     before_ns: int = 60 * NS
     after_ns: int = 10 * NS
