@@ -22,7 +22,7 @@ def triggered_by_hand(ring: Ring, kinds: Sequence[str], talk: Talk, stack: ExitS
     Raises SettingsError where there is no such signal, or no terminal.
     """
     if "signal" in kinds:
-        _on_signal(lambda: ring.fire("signal"), talk)
+        stack.callback(_on_signal(lambda: ring.fire("signal"), talk))
     if "key" not in kinds:
         return []
     pressed = stack.enter_context(_keyboard())
@@ -35,11 +35,13 @@ def triggered_by_hand(ring: Ring, kinds: Sequence[str], talk: Talk, stack: ExitS
     return [look]
 
 
-def _on_signal(fire: Callable[[], object], talk: Talk) -> None:
+def _on_signal(fire: Callable[[], object], talk: Talk) -> Callable[[], object]:
+    """Have the signal fire; gives what undoes that."""
     if not hasattr(signal, "SIGUSR1"):
         raise SettingsError("this system has no SIGUSR1; use --trigger key")
-    signal.signal(signal.SIGUSR1, lambda number, frame: fire())
+    before = signal.signal(signal.SIGUSR1, lambda number, frame: fire())
     talk.say(f"kill -USR1 {os.getpid()} records")
+    return lambda: signal.signal(signal.SIGUSR1, before)
 
 
 @contextmanager
