@@ -220,7 +220,9 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
         flush_ns=0 if recording.to_stdout else FLUSH_NS,
         threaded=True,
     )
-    if check is not None and reading.frames:
-        for item in check.unmatched:
+    if reading.frames:
+        for item in check.unmatched if check is not None else ():
             talk.say(f"--fields: {item!r} has fitted no column of the streams that came")
+        for text in recorder.idle if isinstance(recorder, Ring) else ():
+            talk.say(f"--trigger: {text} has fitted no station or channel of the streams that came")
     return reading, recorder

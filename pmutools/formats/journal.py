@@ -54,7 +54,7 @@ class Journal:
 
         self._file = OutputFile(path)
         self._stream: Any = pa.ipc.new_stream(self._file, _schema())
-        self._shown: set[tuple[Flow, StreamConfig]] = set()
+        self._shown: dict[tuple[Flow, int], tuple[Flow, StreamConfig]] = {}
         self._rows: list[_Row] = []
 
     @property
@@ -63,8 +63,9 @@ class Journal:
 
     def add(self, block: Block) -> None:
         flow, batch = block
-        if (flow, batch.config) not in self._shown:
-            self._shown.add((flow, batch.config))
+        key = flow._replace(connection=0), batch.config.idcode
+        if self._shown.get(key) != (flow, batch.config):
+            self._shown[key] = flow, batch.config
             arrival = batch.arrival_ns[:1].astype("<i8").tobytes()
             frame = encode_config(batch.config)
             self._rows.append((*flow, len(frame), frame, arrival, int(batch.stamp_source[0])))

@@ -120,6 +120,16 @@ def test_streams_without_the_fields_are_left_out_and_that_is_said(pmu: Pmu, tmp_
     assert out.read_text().startswith("time,OTHER.freq_hz\n")
 
 
+def test_a_field_of_a_stream_that_never_came_is_no_mistake(pmu: Pmu, tmp_path: Path) -> None:
+    """One of the two addresses stays silent: its columns are not known."""
+    with fed(frames_of(7, 5)) as port:
+        arguments = ("--fields", "time,PMU 7.freq_hz,GHOST.freq_hz", "--duration", 3)
+        result = pmu("read", url(port), url(free_udp_port()), "--out", tmp_path / "log.csv", *arguments)
+    assert result.code == 0, result.err
+    assert "--fields: 'GHOST.freq_hz' has fitted no column of the streams that came" in result.err
+    assert frames_in(tmp_path / "log.csv") == 5
+
+
 # --- standard output
 
 
@@ -239,6 +249,16 @@ def test_an_excursion_is_recorded_with_what_came_before(pmu: Pmu, tmp_path: Path
     assert frames_in(path) == 100
     assert "trigger freq>60.05: PMU 7 (stream 7) 60.051 Hz at 2016-09-08T17:05:12.020000000Z -> " in result.err
     assert f"kill -USR1 {os.getpid()} records" in result.err
+
+
+def test_a_trigger_that_fits_nothing_is_told_in_the_end(pmu: Pmu, tmp_path: Path) -> None:
+    with fed(frames_of(7, 10)) as port:
+        arguments = ("--trigger", "Z9.freq>1,loss", "--duration", 1)
+        result = pmu("read", url(port), "--out", tmp_path / "event.csv", *arguments)
+    assert result.code == 0, result.err
+    assert "--trigger: Z9.freq>1 has fitted no station or channel of the streams that came" in result.err
+    assert "10 frames of 1 streams -> nothing written" in result.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_signal_records(pmu: Pmu, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from support.reading import block, flow_of, stream
@@ -80,6 +82,14 @@ def test_what_is_not(text: str, words: str) -> None:
 def test_every_single_bit_of_stat_has_a_name() -> None:
     bits = {int(flag) for flag in Stat} - {0x8000, 0x4000}
     assert set(FLAGS.values()) == bits | {0xC000}
+
+
+def test_the_documentation_names_every_condition() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reader.md").read_text(encoding="utf-8")
+    assert all(f"`{flag}`" in page for flag in FLAGS)
+    for text in ("signal", "key", "freq<59.95", "rocof>1", "mag<280e3", "loss>5", "silence>2s", "N1.stat:trigger"):
+        assert f"`{text}`" in page
+        assert parse_condition(text)
 
 
 def fired(text: str, *blocks: object, now_s: float = 0.0) -> list[str]:

@@ -38,10 +38,11 @@ class Known:
         for item in found:
             if not isinstance(item, Block):
                 continue
-            key, config = (item.flow, item.batch.config.idcode), item.batch.config
+            flow, config = item.flow, item.batch.config
+            key = flow._replace(connection=0), config.idcode
             if self.configs.get(key) != config:
                 self.configs[key] = config
-                self._owners.update(receivers.owners(*key))
+                self._owners.update(receivers.owners(flow, config.idcode))
                 fresh.append(config)
                 self._first_ns = now_ns if self._first_ns is None else self._first_ns
         if not self.settled and self._first_ns is not None and len(self._owners) == len(receivers.endpoints):

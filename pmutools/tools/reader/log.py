@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Protocol
 
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.demux import Loss, Message
+from pmutools.c37118.demux import FLOWS, Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats import Sink
 from pmutools.formats.source import Block, frames_of
@@ -56,6 +55,8 @@ class Log:
             return
         for message in messages_of(found, self._shown):
             self.sink.write(message)
+        if len(self._shown) > FLOWS:  # connections made anew and anew: configurations are written once more
+            self._shown.clear()
 
     def flush(self) -> None:
         self.sink.flush()
@@ -64,28 +65,29 @@ class Log:
         self.sink.close()
 
 
-def messages_of(found: Round, shown: Shown) -> Iterator[Message]:
+def messages_of(found: Round, shown: Shown) -> Iterable[Message]:
     """A round's frames in order of arrival, none before its configuration.
 
     ``shown`` are the configurations that have been given out; one that lacks is made up before the first frame that
     needs it. Memory: the frames of the round.
     """
-    walks: list[Sequence[_Keyed]] = []
+    keyed: list[_Keyed] = []
     since: dict[tuple[Flow, int], int] = {}
     for item in found:
         if isinstance(item, Loss):
             continue
         if isinstance(item, Block):
             key = item.flow, item.batch.config.idcode
-            walks.append(list(_keyed(frames_of(item, shown), since.get(key, NO_TIME))))
+            keyed += _keyed(frames_of(item, shown), since.get(key, NO_TIME))
             continue
         frame, flow, config = item
         arrival_ns = NO_TIME if frame.arrival_ns is None else frame.arrival_ns
         if config is not None and frame.type.rules_data:
             shown[flow, config.idcode] = config
             since[flow, config.idcode] = arrival_ns
-        walks.append([(arrival_ns, item)])
-    return map(itemgetter(1), heapq.merge(*walks, key=itemgetter(0)))
+        keyed.append((arrival_ns, item))
+    keyed.sort(key=itemgetter(0))  # which leaves equal ones in their order
+    return map(itemgetter(1), keyed)
 
 
 def _keyed(messages: Iterable[Message], since_ns: int) -> Iterator[_Keyed]:

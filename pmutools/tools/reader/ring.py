@@ -80,6 +80,11 @@ class Ring:
     def paths(self) -> list[Path]:
         return self._files.paths + (self._event.log.paths if self._event is not None else [])
 
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Conditions that no station or channel has fitted so far."""
+        return self._watch.idle
+
     def fire(self, kind: str) -> bool:
         """Someone asks for a recording by ``signal`` or ``key``; it begins with the next round. False: not wanted.
 
