@@ -15,6 +15,8 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from pmutools.flow import StampSource
+
 NATIVE = sys.platform == "linux" and sys.maxsize > 2**32 and os.environ.get("PMUTOOLS_PORTABLE") != "1"
 libc = ctypes.CDLL(None, use_errno=True) if NATIVE else None
 
@@ -29,6 +31,8 @@ MCAST_JOIN_SOURCE_GROUP = 46
 SO_TIMESTAMPING = 37
 TX_SOFTWARE, SOFTWARE, OPT_ID, OPT_TSONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 """Flags of SO_TIMESTAMPING: stamp what is sent, report such stamps, number them, leave the datagram out."""
+RX_HARDWARE, RX_SOFTWARE, RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 6
+"""More of them: have the network card, and the kernel, stamp what arrives; report the card's stamps as they are."""
 MEMINFO_DROPS = 8
 """Index of the drop counter among the nine uint32 of SO_MEMINFO."""
 
@@ -150,21 +154,44 @@ _IOVEC = struct.Struct("@PN")
 _MMSGHDR = struct.Struct("@PI4xPNPNi4xI4x")  # name, namelen, iov, iovlen, control, controllen, flags | msg_len
 _RECEIVED = struct.Struct("@8xI28xNi4xI4x")  # namelen, controllen, flags, msg_len of the same
 _NAME = struct.Struct("@PI")
-_STAMP = struct.Struct("@Niiqq")  # struct cmsghdr and a timespec
+_CMSG = struct.Struct("@Nii")  # struct cmsghdr: length, level, type
+_TIMESPEC = struct.Struct("@qq")
+_SCM_TIMESTAMPING = struct.Struct("@qq16xqq")  # of three timespecs the kernel's and the network card's
 _NAME_ROOM = 32
-_CONTROL_ROOM = 64
+CONTROL_ROOM = 64
+"""Bytes for control messages: one of either kind of stamp."""
 
 
 def _address(buffer: bytearray) -> int:
     return ctypes.addressof((ctypes.c_char * len(buffer)).from_buffer(buffer))
 
 
+class Stamp(NamedTuple):
+    """An arrival time, ns, and who took it. The network card's is in the card's own timescale, often TAI."""
+
+    ns: int
+    source: StampSource
+
+
+def arrival_stamp(kind: int, value: bytes | memoryview) -> Stamp | None:
+    """The stamp in a control message of level SOL_SOCKET; None where it is of another kind, or holds none."""
+    if kind == SO_TIMESTAMPNS:
+        seconds, nanoseconds = _TIMESPEC.unpack_from(value)
+    elif kind == SO_TIMESTAMPING:
+        seconds, nanoseconds, card_s, card_ns = _SCM_TIMESTAMPING.unpack_from(value)
+        if card_s or card_ns:
+            return Stamp(card_s * NS + card_ns, StampSource.HARDWARE)
+    else:
+        return None
+    return Stamp(seconds * NS + nanoseconds, StampSource.KERNEL) if seconds or nanoseconds else None
+
+
 class Datagram(NamedTuple):
-    """One received datagram: ``sockaddr`` is the sender's, raw; ``stamp_ns`` the kernel's arrival stamp, if any."""
+    """One received datagram: ``sockaddr`` is the sender's, raw; ``stamp`` its arrival's, if there is one."""
 
     data: bytes
     sockaddr: bytes
-    stamp_ns: int | None
+    stamp: Stamp | None
 
 
 class ReceiveBatch:
@@ -175,7 +202,7 @@ class ReceiveBatch:
         self._room = room
         self._data = bytearray(size * room)  # zero pages until a datagram touches them
         self._names = bytearray(size * _NAME_ROOM)
-        self._controls = bytearray(size * _CONTROL_ROOM)
+        self._controls = bytearray(size * CONTROL_ROOM)
         self._iovecs = bytearray(size * _IOVEC.size)
         data, name, control, iovec = map(_address, (self._data, self._names, self._controls, self._iovecs))
         for index in range(size):
@@ -186,8 +213,8 @@ class ReceiveBatch:
                 _NAME_ROOM,
                 iovec + index * _IOVEC.size,
                 1,
-                control + index * _CONTROL_ROOM,
-                _CONTROL_ROOM,
+                control + index * CONTROL_ROOM,
+                CONTROL_ROOM,
                 0,
                 0,
             )
@@ -217,15 +244,16 @@ class ReceiveBatch:
         heads = _RECEIVED.iter_unpack(memoryview(self._headers)[: count * _MMSGHDR.size])
         for index, (namelen, controllen, _flags, length) in enumerate(heads):
             start, name = index * self._room, index * _NAME_ROOM
-            stamp_ns = self._stamp_ns(index * _CONTROL_ROOM) if controllen >= _STAMP.size else None
+            stamp = self._stamp(index * CONTROL_ROOM) if controllen > _CMSG.size else None
             data = bytes(self._view[start : start + length])
-            received.append(Datagram(data, bytes(self._names[name : name + namelen]), stamp_ns))
+            received.append(Datagram(data, bytes(self._names[name : name + namelen]), stamp))
         return received
 
-    def _stamp_ns(self, at: int) -> int | None:
-        """The stamp of SO_TIMESTAMPNS, the one control message that our sockets ask for."""
-        _size, level, kind, seconds, nanoseconds = _STAMP.unpack_from(self._controls, at)
-        return seconds * NS + nanoseconds if level == SOL_SOCKET and kind == SO_TIMESTAMPNS else None
+    def _stamp(self, at: int) -> Stamp | None:
+        """The arrival's stamp, the one control message that our sockets ask for."""
+        _size, level, kind = _CMSG.unpack_from(self._controls, at)
+        value = memoryview(self._controls)[at + _CMSG.size : at + CONTROL_ROOM]
+        return arrival_stamp(kind, value) if level == SOL_SOCKET else None
 
 
 class SockAddr:

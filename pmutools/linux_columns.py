@@ -28,7 +28,8 @@ _MMSGHDRS = np.dtype(
 _LONGEST_CALL = 1024
 
 
-def _array_address(array: NDArray[Any]) -> int:
+def array_address(array: NDArray[Any]) -> int:
+    """Where an array's memory begins."""
     return int(array.__array_interface__["data"][0])
 
 
@@ -46,9 +47,9 @@ class SendColumns:
     def _make_room(self, size: int) -> None:
         self._iovecs = np.zeros(size, _IOVECS)
         self._headers = np.zeros(size, _MMSGHDRS)
-        self._headers["iov"] = _array_address(self._iovecs) + 16 * np.arange(size, dtype=np.uint64)
+        self._headers["iov"] = array_address(self._iovecs) + 16 * np.arange(size, dtype=np.uint64)
         self._headers["iovlen"] = 1
-        self._headers_at = _array_address(self._headers)
+        self._headers_at = array_address(self._headers)
 
     def load(
         self,
@@ -68,7 +69,7 @@ class SendColumns:
             self._make_room(max(count, 2 * len(self._headers)))
         self._base = base
         iovecs, headers = self._iovecs[:count], self._headers[:count]
-        iovecs["base"] = at + _array_address(base)
+        iovecs["base"] = at + array_address(base)
         iovecs["size"] = nbytes
         headers["name"] = names
         headers["namelen"] = namelens
@@ -118,8 +119,8 @@ class DepartureBatch:
             self._controls[start : start + size * _DEPARTURE_ROOM].view(_DEPARTURE) for start in (0, _STAMPNS_SPACE)
         ]
         self._headers = np.zeros(size, _MMSGHDRS)
-        self._headers["control"] = _array_address(self._controls) + _DEPARTURE_ROOM * np.arange(size, dtype=np.uint64)
-        self._headers_at = ctypes.c_void_p(_array_address(self._headers))
+        self._headers["control"] = array_address(self._controls) + _DEPARTURE_ROOM * np.arange(size, dtype=np.uint64)
+        self._headers_at = ctypes.c_void_p(array_address(self._headers))
 
     def read(self, fd: int) -> tuple[NDArray[np.uint32], NDArray[np.int64], bool]:
         """(ids, UTC ns, whether more may wait), in the order of the queue.

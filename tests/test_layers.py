@@ -16,7 +16,7 @@ LAYERS = [
     ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws", "pmutools.loglinear"],
     ["pmutools.linux", "pmutools.parsers"],
     ["pmutools.clock", "pmutools.linux_columns", "pmutools.realtime", "pmutools.settings"],
-    ["pmutools.pacing"],
+    ["pmutools.host", "pmutools.linux_receive", "pmutools.pacing"],
     # the codec, sans-I/O
     ["pmutools.c37118"],
     ["pmutools.c37118_scapy", "pmutools.schema", "pmutools.impair", "pmutools.net", "pmutools.modal"],

@@ -156,7 +156,7 @@ def test_batches_keep_order_bytes_senders_and_stamps(family: int, host: str) -> 
     after_ns = time.time_ns()
     assert [datagram.data for datagram in got] == frames
     assert {unpack_sockaddr(datagram.sockaddr) for datagram in got} == {Address(family, sender.getsockname())}
-    stamps = [datagram.stamp_ns for datagram in got if datagram.stamp_ns is not None]
+    stamps = [datagram.stamp.ns for datagram in got if datagram.stamp is not None]
     assert len(stamps) > 100  # the first may come before the kernel has switched stamping on
     assert all(before_ns <= stamp <= after_ns for stamp in stamps)
     assert stamps == sorted(stamps)

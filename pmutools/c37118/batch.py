@@ -71,6 +71,25 @@ class Batch:
         kept = {f.name: getattr(self, f.name) for f in fields(self)}
         return Batch(**{name: v if name == "config" or v is None else v[rows] for name, v in kept.items()})
 
+    def cut(self, rows: slice, config: StreamConfig, frames: bytes) -> Batch:
+        """A copy of a slice as ``frames`` of ``config``, which is laid out alike (layout_of)."""
+        assert self.wire is not None
+        return Batch(
+            config,
+            self.time_ns[rows].copy(),
+            self.arrival_ns[rows].copy(),
+            self.stamp_source[rows].copy(),
+            self.time_quality[rows].copy(),
+            self.stat[rows].copy(),
+            self.phasors[rows].copy(),
+            self.frequency[rows].copy(),
+            self.rocof[rows].copy(),
+            self.analogs[rows].copy(),
+            self.digitals[rows].copy(),
+            self.valid[rows].copy(),
+            np.frombuffer(frames, self.wire.dtype),
+        )
+
     def data(self) -> Iterator[Data]:
         """Each frame as :class:`Data`, from its wire bytes, encoded first where there are none."""
         wire = self.wire if self.wire is not None else wire_view(encode_batch(self)[0].tobytes(), self.config)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import accumulate
 from typing import Literal, NamedTuple
 
 from pmutools.c37118.checksum import sealed
@@ -160,6 +161,12 @@ class StreamConfig:
         return PREFIX_SIZE + sum(station.block_size for station in self.stations) + CHK_SIZE
 
     @cached_property
+    def stat_offsets(self) -> tuple[int, ...]:
+        """Where the high byte of each station's STAT lies in a data frame."""
+        sizes = (station.block_size for station in self.stations[:-1])
+        return tuple(accumulate(sizes, initial=PREFIX_SIZE)) if self.stations else ()
+
+    @cached_property
     def body(self) -> bytes:
         """Payload of the configuration frame, between prefix and CHK."""
         return _encode_body(self)
@@ -250,6 +257,35 @@ def as_kind(config: StreamConfig, kind: FrameType) -> StreamConfig:
     return replace(
         config, kind=kind, version=kind.version, stations=tuple(convert(station) for station in config.stations)
     )
+
+
+def abridges(short: StreamConfig, full: StreamConfig) -> bool:
+    """Whether a CFG-2 says of a stream what a CFG-3 says, as far as it can: a device may send it unasked, now and then.
+
+    Units and digital masks, which devices fill in each in its own way, are not compared; PHUNIT is where it counts.
+    """
+    if (short.kind, full.kind, short.idcode) != (FrameType.CFG2, FrameType.CFG3, full.idcode):
+        return False
+    cut = as_kind(full, FrameType.CFG2)
+    return _gist(short) == _gist(cut) and all(
+        abs(said.phunit - known.phunit) <= 1
+        for ours, theirs in zip(short.stations, cut.stations, strict=True)
+        for said, known in zip(ours.phasors, theirs.phasors, strict=True)
+        if not ours.format & Format.PHASOR_FLOAT
+    )
+
+
+def _gist(config: StreamConfig) -> tuple[object, ...]:
+    names = [
+        (
+            (station.name, station.idcode, station.format, station.fnom, station.cfgcnt),
+            *(channel.name for channel in station.phasors),
+            *(channel.name for channel in station.analogs),
+            *(word.labels for word in station.digitals),
+        )
+        for station in config.stations
+    ]
+    return config.time_base, config.data_rate, [len(station.phasors) for station in config.stations], names
 
 
 # --- names ------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from pmutools.c37118.checksum import chk_array
-from pmutools.c37118.config import StreamConfig, decode_config, decode_config_body
+from pmutools.c37118.config import StreamConfig, abridges, decode_config, decode_config_body
 from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
 from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason
 from pmutools.c37118.prefix import decode_prefix
@@ -27,7 +27,7 @@ HELD_BYTES = 4 << 20
 ALL_HELD_BYTES = 64 << 20
 FRAGMENT_BYTES = 1 << 20
 FLOWS = 1 << 16
-"""Flows remembered at once; the oldest is ended when another comes (a flood of spoofed sources)."""
+"""Flows remembered at once; when another comes (a flood of spoofed sources), one is ended that has long been silent."""
 _FIRST_FRAGMENT, _LAST_FRAGMENT = 1, 0xFFFF
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 _DATA = FrameType.DATA  # looking a member up takes longer than most of what is done with it
@@ -37,7 +37,8 @@ class Message(NamedTuple):
     """A verified frame.
 
     ``config`` is the one in force for a data frame, the decoded one for a configuration frame (None if its content is
-    no configuration), and for headers and commands that of their stream, where it is known.
+    no configuration), and for headers and commands that of their stream, where it is known. A CFG-2 that says no more
+    than the CFG-3 in force leaves that in force, and counts as it.
     """
 
     frame: Frame
@@ -120,6 +121,8 @@ class _FlowState:
         self.proven = False
         self.early: list[Skipped] = []
         self.early_bytes = 0
+        self.fresh = True
+        """Whether it was fed since a flow to end was last looked for."""
 
 
 def _all_good(train: Train) -> bool:
@@ -142,6 +145,8 @@ class Demux:
         self._waiting: dict[_Place, dict[Flow, _FlowState]] = {}
         """Who holds data, the place that has waited longest first."""
         self._held_bytes = 0
+        self.put_on_hold: list[int] = []
+        """IDCODEs of the data frames that the last :meth:`feed` has put on hold."""
         self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
 
     def feed(self, chunk: Chunk) -> list[Message | Loss]:
@@ -151,8 +156,11 @@ class Demux:
         state = self._flows.get(flow)
         if state is None:
             if len(self._flows) >= FLOWS:
-                out += self.end(next(iter(self._flows)))
+                out += self.end(self._silent_flow())
             state = self._flows[flow] = _FlowState(flow)
+        state.fresh = True
+        if self.put_on_hold:
+            self.put_on_hold.clear()
         tally = self.tally
         tally.fed += len(data)
         for item in state.framer.feed(data, arrival_ns, stamp_source, lost_before):
@@ -166,20 +174,45 @@ class Demux:
 
     def feed_train(self, train: Train) -> list[Message | Loss | DataRun]:
         """:meth:`feed` of all datagrams of a train; they stay together where they are good frames of one known kind."""
-        state, count = self._flows.get(train.flow), len(train.arrivals_ns)
-        config = state.fitting.get(train.data[:6]) if state else None
+        config = self.fitting(train.flow, train.data[:6])
         if (
-            state
-            and config
+            config is not None
             and config.frame_size == train.size
-            and config.idcode not in state.borrowed  # another flow may change that between two of these
-            and not state.framer.pending
+            and not self.is_borrowed(train.flow, config.idcode)  # another flow may change it between two of these
             and _all_good(train)
+            and self.take(run := DataRun(train, config))
         ):
-            self.tally.count(_DATA, count, train.size)
-            state.framer.pass_over(len(train.data))
-            return [DataRun(train, config)]
+            return [run]
         return [item for chunk in train.chunks() for item in self.feed(chunk)]
+
+    def fitting(self, flow: Flow, head: bytes) -> StreamConfig | None:
+        """The configuration that whole frames of ``flow`` would be read by, by their first six bytes.
+
+        None: they would not, or not yet be data frames of a known kind; only :meth:`feed` can tell.
+        """
+        state = self._flows.get(flow)
+        if state is None or (flow.is_stream and state.framer.pending):
+            return None
+        return state.fitting.get(head)
+
+    def is_borrowed(self, flow: Flow, idcode: int) -> bool:
+        """Whether the stream's configuration is one that another flow has shown, or a saved one."""
+        state = self._flows.get(flow)
+        return state is not None and idcode in state.borrowed
+
+    def take(self, run: DataRun) -> bool:
+        """Take whole, good frames, all with a head that :meth:`fitting` knows; false where that has changed meanwhile.
+
+        Then they are to be fed one by one.
+        """
+        (data, size, arrivals_ns, flow, _), config = run
+        state = self._flows.get(flow)
+        if state is None or state.fitting.get(data[:6]) is not config:
+            return False
+        state.fresh = True
+        state.framer.pass_over(len(data))
+        self.tally.count(_DATA, len(arrivals_ns), size)
+        return True
 
     def end(self, flow: Flow) -> list[Message | Loss]:
         """A connection or file is over: frame or skip what is pending in it, and forget it."""
@@ -204,17 +237,23 @@ class Demux:
             for state in self._flows.values()
         )
 
-    def held(self, flow: Flow) -> dict[int, int]:
-        """Bytes of ``flow``'s data frames that wait for a fitting configuration, by IDCODE."""
-        state = self._flows.get(flow)
-        return {idcode: held.nbytes for idcode, held in state.held.items()} if state else {}
-
     def ignore(self, flow: Flow, idcode: int) -> None:
         """Give up what is held of a stream that nobody wants; its bytes count as ignored."""
         state = self._flows.get(flow)
         if state is not None and (held := state.held.pop(idcode, None)) is not None:
-            self._waiting.get((state.host, idcode), {}).pop(flow, None)
+            _forget(self._waiting, (state.host, idcode), flow)
+            self._held_bytes -= held.nbytes
             self.tally.ignored += held.nbytes
+
+    def _silent_flow(self) -> Flow:
+        """The first flow that was not fed since it was last looked at here; the others go to the end of the line."""
+        flows = self._flows
+        while True:
+            flow, state = next(iter(flows.items()))
+            if not state.fresh:
+                return flow
+            state.fresh = False
+            flows[flow] = flows.pop(flow)
 
     def _end(self, state: _FlowState, out: list[Message | Loss]) -> None:
         for item in state.framer.close():
@@ -286,10 +325,12 @@ class Demux:
                 config = decode_config(frame.data)[1]
         except WireError:
             pass  # a good frame whose content is not: it stays a message, with no configuration
+        current = state.configs.get(config.idcode) if config is not None else None
+        if config is not None and current is not None and abridges(config, current):
+            config = current
         self._emit(Message(frame, state.flow, config), kind, out)
         if config is None or not kind.rules_data:
             return
-        current = state.configs.get(config.idcode)
         place = (state.host, config.idcode)
         if current is None or current != config:
             state.configs[config.idcode] = config
@@ -343,6 +384,7 @@ class Demux:
         held.frames.append(frame)
         held.nbytes += size
         self._held_bytes += size
+        self.put_on_hold.append(frame.idcode)
         self._waiting.setdefault((state.host, frame.idcode), {})[state.flow] = state
 
     def _give_up(self, state: _FlowState, idcode: int, out: list[Message | Loss]) -> None:

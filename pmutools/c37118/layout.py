@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakValueDictionary
 
 from pmutools.c37118.config import PhasorChannel, Station, StreamConfig
 from pmutools.c37118.constants import PREFIX_SIZE, Format
@@ -119,9 +120,9 @@ def station_fields(station: Station, offset: int, index: int) -> Iterator[Field]
             index += field.width * count
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Layout:
-    """Everything derived from a configuration that decoding its data frames needs."""
+    """Everything derived from a configuration that decoding its data frames needs; the same object for all alike."""
 
     stations: tuple[tuple[Field, ...], ...]
     unpacker: struct.Struct
@@ -136,9 +137,16 @@ class Layout:
         return self.unpacker.size
 
 
+_known: WeakValueDictionary[tuple[object, ...], Layout] = WeakValueDictionary()
+"""Layouts in use, by what they are made of."""
+
+
 @lru_cache(maxsize=4096)
 def layout_of(config: StreamConfig) -> Layout:
-    """The layout of ``config``'s data frames, made once a configuration."""
+    """The layout of ``config``'s data frames, made once a configuration.
+
+    It is the same object for configurations whose frames are decoded alike, such as those of PMUs of one model.
+    """
     offset, index = PREFIX_SIZE, len(PREFIX_FIELDS)
     stations, phasors, analogs, slots = [], list[PhasorSlot](), list[AnalogSlot](), list[StationSlots]()
     digital_column = 0
@@ -172,7 +180,7 @@ def layout_of(config: StreamConfig) -> Layout:
         offset, index = last.offset + last.size, last.first + last.width * last.items
     codes = [field.code for field in PREFIX_FIELDS]
     codes += [field.code * field.items for fields_ in stations for field in fields_]
-    return Layout(
+    layout = Layout(
         tuple(stations),
         struct.Struct(f">{''.join(codes)}H"),
         tuple(phasors),
@@ -181,6 +189,8 @@ def layout_of(config: StreamConfig) -> Layout:
         config.time_base,
         tuple(_runs(config, stations, slots)),
     )
+    nominal = tuple(slot.fnom_hz for slot in slots)
+    return _known.setdefault((layout.stations, layout.phasors, layout.analogs, layout.time_base, nominal), layout)
 
 
 _PLAIN = PhasorSlot(0, polar=False, floating=True, factor=1.0, angle_offset_rad=0.0)[1:]

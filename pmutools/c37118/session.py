@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from pmutools.c37118.config import StreamConfig, as_kind, encode_config
-from pmutools.c37118.constants import PREFIX_SIZE, Command, FrameType
+from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.frames import decode_command, encode_command, encode_header, restamp
 from pmutools.errors import WireError
 from pmutools.timebase import NS, from_ns
@@ -151,6 +151,8 @@ class Timing:
 
     answer_ns: int = 3 * NS
     """For a configuration, before it asks again; also the shortest time between two requests that changes provoke."""
+    cfg3_ns: int = NS
+    """For a CFG-3, before it asks for CFG-2: most devices know none, and stay silent."""
     tries: int = 3
     """Time-outs in a row before the connection is given up."""
     silence_ns: int = 5 * NS
@@ -175,11 +177,12 @@ class ClientRole:
         self.state = ClientState.IDLE
         self.deadline_ns: int | None = None
         self.config: StreamConfig | None = None
+        self.heard_ns = 0
+        """When data last came."""
+        self.announced = False
+        """Whether a change of the configuration is announced: STAT bit 10 of any station."""
         self._timeouts = 0
-        self._heard_ns = 0
         self._asked_ns: int | None = None
-        self._announced = False
-        self._stats: tuple[int, ...] = ()
 
     def handle(self, event: ClientEvent, now_ns: int) -> tuple[ClientAction, ...]:
         """Take one step of the table."""
@@ -197,40 +200,45 @@ class ClientRole:
         return actions
 
     def hear_config(self, config: StreamConfig, now_ns: int) -> tuple[ClientAction, ...]:
-        """A configuration for this stream came, asked for or not."""
-        self.config = config
-        self._stats = _stat_offsets(config)
-        return self.handle(ClientEvent.CONFIG, now_ns)
+        """A configuration for this stream came, asked for or not.
+
+        A CFG-2 that came unasked and says something else than the CFG-3 before it is in force, and makes us ask again.
+        """
+        before, self.config = self.config, config
+        less = before is not None and before.kind is FrameType.CFG3 and config.kind is not FrameType.CFG3
+        event = ClientEvent.CHANGED if less and self.state in _RUNNING and self._may_ask(now_ns) else ClientEvent.CONFIG
+        return self.handle(event, now_ns)
 
     def hear_data(self, frame: bytes, config: StreamConfig, now_ns: int) -> tuple[ClientAction, ...]:
         """A data frame came that ``config`` fits."""
-        if config is not self.config:
-            self.config, self._stats = config, _stat_offsets(config)
-        self._heard_ns = now_ns
-        self._timeouts = 0
-        actions: tuple[ClientAction, ...] = ()
-        if self.state is not ClientState.STREAMING:
-            actions = self.handle(ClientEvent.DATA, now_ns)
+        actions = self.hear_alike(config, now_ns)
         announced = False
-        for at in self._stats:  # STAT 0xFFFF is some senders' "undefined"
+        for at in config.stat_offsets:  # STAT 0xFFFF is some senders' "undefined"
             if frame[at] & 4 and frame[at : at + 2] != b"\xff\xff":
                 announced = True
-        if announced is not self._announced and self._may_ask(now_ns):
-            self._announced = announced
+        if announced is not self.announced and self._may_ask(now_ns):
+            self.announced = announced
             actions += self.handle(ClientEvent.CHANGED, now_ns)
         return actions
 
+    def hear_alike(self, config: StreamConfig, now_ns: int) -> tuple[ClientAction, ...]:
+        """Data frames came that ``config`` fits, and whose STAT bits 10 announce what :attr:`announced` says."""
+        self.config = config
+        self.heard_ns = now_ns
+        self._timeouts = 0
+        return self.handle(ClientEvent.DATA, now_ns) if self.state is not ClientState.STREAMING else ()
+
     def hear_misfit(self, now_ns: int) -> tuple[ClientAction, ...]:
         """A data frame came that no known configuration fits."""
-        self._heard_ns = now_ns
+        self.heard_ns = now_ns
         return self.handle(ClientEvent.CHANGED, now_ns) if self._may_ask(now_ns) else ()
 
     def check_time(self, now_ns: int) -> tuple[ClientAction, ...]:
         """To be called at :attr:`deadline_ns` or later; does nothing before."""
         if self.deadline_ns is None or now_ns < self.deadline_ns:
             return ()
-        if self.state is ClientState.STREAMING and now_ns - self._heard_ns < self.silence_ns:
-            self.deadline_ns = self._heard_ns + self.silence_ns
+        if self.state is ClientState.STREAMING and now_ns - self.heard_ns < self.silence_ns:
+            self.deadline_ns = self.heard_ns + self.silence_ns
             return ()
         self._timeouts += 1
         exhausted = self._timeouts >= self.timing.tries and self.state is not ClientState.STREAMING
@@ -250,16 +258,12 @@ class ClientRole:
         if (self.state, ClientEvent.TIMEOUT) not in self.table:
             return None
         waits_for_data = self.state in (ClientState.WAIT_DATA, ClientState.STREAMING)
-        return now_ns + (self.silence_ns if waits_for_data else self.timing.answer_ns)
+        if waits_for_data:
+            return now_ns + self.silence_ns
+        return now_ns + (self.timing.cfg3_ns if self.state is ClientState.WAIT_CFG3 else self.timing.answer_ns)
 
 
-def _stat_offsets(config: StreamConfig) -> tuple[int, ...]:
-    """Where the high byte of each station's STAT lies in a data frame."""
-    offsets, at = [], PREFIX_SIZE
-    for station in config.stations:
-        offsets.append(at)
-        at += station.block_size
-    return tuple(offsets)
+_RUNNING = (ClientState.WAIT_DATA, ClientState.STREAMING)
 
 
 # --- server ------------------------------------------------------------------------------------------------------

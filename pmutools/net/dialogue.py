@@ -36,8 +36,26 @@ class LinkKind(StrEnum):
     """Some seconds after the start, nothing at all has come."""
     FOREIGN = "foreign"
     """Frames come that no endpoint asks for: another IDCODE, or another sender."""
+    DUPLICATE = "duplicate"
+    """Two senders send one IDCODE to one port."""
+    NOISE = "noise"
+    """What comes to a port is no C37.118."""
     OWN_DROPS = "own-drops"
     """This machine's receive buffer was full: ``datagrams`` are lost, and not by the network."""
+
+
+AGEING_NS = 120_000_000_000, 600_000_000_000
+"""A switch that snoops IGMP forgets a group some four minutes after the last report that it has seen."""
+
+
+def silence(multicast: bool, open_ns: int) -> str:
+    """What a silence may come from that began when a stream had been listened to for ``open_ns``."""
+    if not multicast or not AGEING_NS[0] <= open_ns <= AGEING_NS[1]:
+        return ""
+    return (
+        f"{open_ns // 60_000_000_000} minutes after the group was joined; if other groups stop too, a switch has "
+        "forgotten who listens: there must be an IGMP querier in this network"
+    )
 
 
 class LinkEvent(NamedTuple):
@@ -90,6 +108,13 @@ class Dialogue:
                 self._known = config
                 self._tell(LinkKind.CONFIGURED, f"{config.kind.name}, {_rate(config)}, {len(config.stations)} stations")
             self._after(before, role.hear_config(config, now_ns))
+
+    def hear_alike(self, config: StreamConfig, now_ns: int) -> None:
+        """Take note of data frames of this stream in which STAT announces what it did (``role.announced``)."""
+        role, before = self.role, self.role.state
+        actions = role.hear_alike(config, now_ns)
+        if actions or role.state is not before:
+            self._after(before, actions)
 
     def hear_misfit(self, now_ns: int) -> None:
         """A data frame came that no known configuration fits."""

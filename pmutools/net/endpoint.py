@@ -9,8 +9,9 @@
 
 Keys of the query: ``idcode`` picks the stream; ``iface`` (an address or a name) is the local interface for multicast
 and the local address of a connection; ``source`` is the only sender a reader accepts (source-specific multicast), and
-the address a player sends from; ``ttl`` is that of multicast. IPv6 addresses stand in brackets. Port 0 means any free
-one, for an end that binds.
+the address a player sends from; ``ttl`` is that of multicast; ``stamps=hardware`` has a reader take the network card's
+arrival stamps, in the card's own timescale, where the card makes them. IPv6 addresses stand in brackets. Port 0 means
+any free one, for an end that binds.
 """
 
 from __future__ import annotations
@@ -53,12 +54,15 @@ class Endpoint:
     data_host: str | None = None
     data_port: int | None = None
     ttl: int | None = None
+    hardware_stamps: bool = False
+    """``stamps=hardware``; ``stamps=kernel`` is what holds without the key."""
 
     def __str__(self) -> str:
         data = None
         if self.data_port is not None:
             data = join_host(self.data_host, self.data_port) if self.data_host else str(self.data_port)
         query = {"idcode": self.idcode, "data": data, "iface": self.iface, "source": self.source, "ttl": self.ttl}
+        query["stamps"] = "hardware" if self.hardware_stamps else None
         text = urlencode({key: value for key, value in query.items() if value is not None}, safe=":[]")
         return f"{self.scheme}://{join_host(self.host, self.port)}{'?' if text else ''}{text}"
 
@@ -129,11 +133,12 @@ def parse_endpoint(url: str) -> Endpoint:
         data_host=data_host,
         data_port=data_port,
         ttl=_number(url, query, "ttl", 0, 255),
+        hardware_stamps=_stamps(url, query.get("stamps", "kernel")),
     )
 
 
 _SCHEMES = frozenset(map(str, Scheme))
-_KEYS = ("idcode", "data", "iface", "source", "ttl")
+_KEYS = ("idcode", "data", "iface", "source", "ttl", "stamps")
 
 
 def _prefixes() -> list[str]:
@@ -172,6 +177,12 @@ def _address(url: str, query: dict[str, str], key: str) -> str | None:
         return str(ipaddress.ip_address(text.strip("[]")))
     except ValueError:
         raise SettingsError(f"{url}: {key}={text} is not an IP address") from None
+
+
+def _stamps(url: str, text: str) -> bool:
+    if text not in ("kernel", "hardware"):
+        raise SettingsError(f"{url}: stamps={text} is neither kernel nor hardware")
+    return text == "hardware"
 
 
 def _data(url: str, text: str | None, scheme: Scheme) -> tuple[str | None, int | None]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ipaddress
 import socket
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
+from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Message
 from pmutools.c37118.session import (
     ClientAction,
@@ -20,11 +21,12 @@ from pmutools.c37118.session import (
 )
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Chunk, Flow
-from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind
+from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind, silence
 from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.net.intake import Intake, Swept
 from pmutools.net.reactor import READ, WRITE, Reactor, Timer
 from pmutools.net.sockets import Address, explain, resolve
-from pmutools.net.tcp import TcpClient
+from pmutools.net.tcp import TcpClient, TcpCounts
 from pmutools.net.udp import Batches, UdpSocket
 
 CONNECT_NS = 5_000_000_000
@@ -32,15 +34,18 @@ UNKNOWN_IDCODE = 1
 """Asked for where the user names no IDCODE, until a frame shows the right one."""
 
 
-class Plumbing(NamedTuple):
+@dataclass
+class Plumbing:
     """What all links of one front end share. ``emit`` takes what :meth:`Receivers.poll` gives out."""
 
     reactor: Reactor
     emit: Callable[[Chunk | LinkEvent], None]
     batches: Batches | None
     native: bool
-    links: dict[Flow, CommandLink]
+    links: dict[Flow, CommandLink] = field(default_factory=dict)
     """By the flows that the links have opened; :class:`Receivers` takes them out."""
+    intake: Intake | None = None
+    """Where what comes is gathered; without one it is emitted in chunks."""
 
 
 class CommandLink:
@@ -75,6 +80,11 @@ class CommandLink:
         self._connections = 0
         self._failures = 0
         self._timer: Timer | None = None
+        self._opened_ns = 0
+        self._number = 0
+        self.noise = ""
+        """What came first on this connection and is no C37.118; empty once something is."""
+        self._ended = TcpCounts()
         self._open()
 
     def learn(self, idcode: int) -> None:
@@ -88,9 +98,33 @@ class CommandLink:
 
     def heard(self, message: Message, now_ns: int) -> None:
         """A message of this endpoint's stream came, over whichever channel; ``now_ns`` is monotonic."""
+        self.noise = ""
         self.dialogue.hear(message, now_ns)
         if self.dialogue.role.state is ClientState.STREAMING:
             self._failures = 0
+
+    def heard_alike(self, config: StreamConfig, now_ns: int) -> None:
+        """Data frames came, whose STAT bits 10 are what the role knows already."""
+        self.dialogue.hear_alike(config, now_ns)
+        self._failures = 0
+
+    def listen(self) -> None:
+        """Have what comes read, the way that holds now."""
+        transport, intake, reactor = self._transport, self.plumbing.intake, self.plumbing.reactor
+        if transport is None or self.flow is None:
+            return
+        if intake is not None:
+            self._number = intake.add(self.flow)
+            if isinstance(transport, UdpSocket) and transport.stamps:
+                reactor.forget(transport)
+                intake.sweep(transport, Swept(self._number, transport.rcvbuf_bytes, self._broken, self._waits))
+                return
+        reactor.watch(transport, READ, self._read)
+
+    def tcp_counts(self) -> TcpCounts:
+        """What the kernel tells of this endpoint's connections, those that have ended included."""
+        now = self._transport.counts() if isinstance(self._transport, TcpClient) else TcpCounts()
+        return TcpCounts(*map(sum, zip(self._ended, now, strict=True)))
 
     def close(self) -> None:
         """Stop the data, unless they go to a group that others may be listening to, and hang up."""
@@ -111,10 +145,17 @@ class CommandLink:
                 )
                 self._transport = udp
                 udp.connect(self.address)
-                reactor.watch(udp, READ, lambda _: self._read_udp(udp))
+                if self.endpoint.hardware_stamps:
+                    udp.stamp_by_hardware()
                 self._opened(Flow("udp", str(self.address), str(udp.address)))
                 return
-            tcp = TcpClient(self.address, local=self._local, connection=self._connections, native=self.plumbing.native)
+            tcp = TcpClient(
+                self.address,
+                local=self._local,
+                connection=self._connections,
+                native=self.plumbing.native,
+                hardware_stamps=self.endpoint.hardware_stamps,
+            )
         except SourceError as error:
             self._fail(LinkKind.FAILED, str(error))
             return
@@ -134,32 +175,38 @@ class CommandLink:
         if self._timer is not None:
             self._timer.cancelled = True
         self._connections += 1
-        self.plumbing.reactor.watch(tcp, READ, lambda _: self._read_tcp(tcp))
         self._opened(tcp.flow)
 
     def _opened(self, flow: Flow) -> None:
         self.flow = flow
+        self.noise = ""
+        self._opened_ns = self.plumbing.reactor.clock.monotonic_ns()
         self.plumbing.links[flow] = self
+        self.listen()
         self._tell(LinkKind.CONNECTED, f"from {flow.destination}")
         self.dialogue.step(ClientEvent.OPENED)
 
-    def _read_tcp(self, tcp: TcpClient) -> None:
+    def _read(self, _events: int) -> None:
+        transport, plumbing = self._transport, self.plumbing
+        assert transport is not None
         try:
-            chunk = tcp.read()
+            if plumbing.intake is not None:
+                plumbing.intake.read(transport, self._number, stream=self._over_tcp, awaited=self._waits())
+            elif isinstance(transport, UdpSocket):
+                for datagram in transport.read():
+                    plumbing.emit(datagram)
+            elif (chunk := transport.read()) is not None:
+                plumbing.emit(chunk)
         except OSError as error:
-            self._fail(LinkKind.LOST, str(explain(error, self.endpoint)))
-            return
-        if chunk is not None:
-            self.plumbing.emit(chunk)
+            self._broken(error)
 
-    def _read_udp(self, udp: UdpSocket) -> None:
-        try:
-            chunks = udp.read()
-        except OSError as error:  # the answer to what we sent: nobody is there
-            self._fail(LinkKind.FAILED, str(explain(error, self.endpoint)))
-            return
-        for chunk in chunks:
-            self.plumbing.emit(chunk)
+    def _waits(self) -> bool:
+        """Whether what comes may be an answer, with which the conversation goes on."""
+        return self.dialogue.role.state is not ClientState.STREAMING
+
+    def _broken(self, error: OSError) -> None:
+        """Nothing more comes; over UDP this is the answer to what we sent: nobody is there."""
+        self._fail(LinkKind.LOST if self._over_tcp else LinkKind.FAILED, str(explain(error, self.endpoint)))
 
     def _act(self, action: ClientAction, before: ClientState) -> None:
         if action is ClientAction.DISCONNECT:
@@ -177,7 +224,11 @@ class CommandLink:
 
     def _silence(self, before: ClientState) -> str:
         if before is ClientState.WAIT_DATA:
-            return f"{self.endpoint}: no data came after the start command"
+            where = self.endpoint.data_port
+            question = f"; does the server send them to UDP port {where}, and no firewall take them?" if where else ""
+            return f"{self.endpoint}: no data came after the start command{question}"
+        if self.noise:
+            return f"{self.endpoint}: what came is no C37.118: {self.noise}; is it another service's port?"
         asked = f"IDCODE {self.idcode}" if self.idcode else f"IDCODE {UNKNOWN_IDCODE} (none was given)"
         return f"{self.endpoint}: no configuration came; a device answers its own IDCODE only, {asked} was asked for"
 
@@ -193,11 +244,17 @@ class CommandLink:
         if self._timer is not None:
             self._timer.cancelled = True
         if self._transport is not None:
+            self._ended = self.tcp_counts()
             self.plumbing.reactor.forget(self._transport)
+            if (intake := self.plumbing.intake) is not None:
+                intake.forget(self._transport)
+                intake.drop(self._number)
             self._transport.close()
         self._transport = self.flow = None
 
     def _tell(self, kind: LinkKind, detail: str) -> None:
+        if kind is LinkKind.SILENT:
+            detail = silence(self.endpoint.is_multicast, self.plumbing.reactor.clock.monotonic_ns() - self._opened_ns)
         self.plumbing.emit(LinkEvent(kind, str(self.endpoint), self.owners, detail, self.idcode, self.flow))
 
 

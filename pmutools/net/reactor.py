@@ -40,6 +40,8 @@ class Reactor:
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._selector = selectors.DefaultSelector()
+        self._handlers: dict[int, Callable[[int], None]] = {}
+        """By descriptor."""
         self._timers: list[tuple[int, int, Timer]] = []
         self._order = count()
         self._forgotten: set[int] = set()
@@ -49,9 +51,10 @@ class Reactor:
     def watch(self, source: HasFileno, events: int, handler: Callable[[int], None]) -> None:
         """Call ``handler(events)`` when ``source`` is ready; replaces what was watched before."""
         try:
-            self._selector.modify(source, events, handler)
+            key = self._selector.modify(source, events)
         except KeyError:
-            self._selector.register(source, events, handler)
+            key = self._selector.register(source, events)
+        self._handlers[key.fd] = handler
 
     def forget(self, source: HasFileno) -> None:
         """Stop watching, before ``source`` is closed; nothing happens if it was not watched."""
@@ -59,6 +62,7 @@ class Reactor:
             fd = self._selector.unregister(source).fd
         except (KeyError, ValueError):
             return
+        del self._handlers[fd]
         self._forgotten.add(fd)
         self._again.pop(fd, None)
 
@@ -99,7 +103,7 @@ class Reactor:
 
     def _handle(self, owed: dict[int, int], budget_ns: int | None) -> None:
         end_ns = None if budget_ns is None else self.clock.monotonic_ns() + budget_ns
-        handlers = self._selector.get_map()
+        handlers = self._handlers
         late = False
         for fd, events in owed.items():
             if fd in self._forgotten:  # an earlier handler of this round has closed it
@@ -107,7 +111,7 @@ class Reactor:
             if late:
                 self._again[fd] = self._again.get(fd, 0) | events
                 continue
-            handlers[fd].data(events)
+            handlers[fd](events)
             late = end_ns is not None and self.clock.monotonic_ns() >= end_ns
 
     def _select(self, timeout_ns: int | None) -> list[tuple[selectors.SelectorKey, int]]:

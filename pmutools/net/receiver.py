@@ -11,68 +11,44 @@
 :meth:`Receivers.poll` binds, connects, reads and stamps. :meth:`Receivers.parse` frames, finds the configuration and
 plays the client's part (asks for it, starts the data, asks again when it changes). They are two steps so that raw bytes
 can be kept, and a control loop can tell receiving from parsing; every item must go through both, in order.
+
+Who can wait a little takes all that came in some tenths of a second at once, at a tenth of the cost::
+
+    receivers.soak(250_000_000)             # receive for 250 ms
+    for item in receivers.collect():        # Message | Loss | DataRun | LinkEvent
+        ...
+
+What comes out is the same: what is not a whole data frame of a known stream goes the other way's way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from types import TracebackType
-from typing import NamedTuple
 
 from pmutools import linux
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.demux import Demux, Loss, Message
-from pmutools.c37118.session import (
-    CFG2_FIRST,
-    CFG3_FIRST,
-    SAVED_CONFIG,
-    SPONTANEOUS,
-    ClientEvent,
-    ClientRole,
-    ClientTable,
-    Timing,
-)
+from pmutools.c37118.demux import DataRun, Demux, Loss, Message
+from pmutools.c37118.session import CFG2_FIRST, CFG3_FIRST, SAVED_CONFIG, ClientTable, Timing
 from pmutools.clock import Clock
 from pmutools.flow import Chunk, Flow
-from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind
+from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
+from pmutools.net.intake import Intake, Swept
 from pmutools.net.link import CommandLink, Plumbing
 from pmutools.net.reactor import READ, Reactor
-from pmutools.net.sockets import RCVBUF_BYTES, Address
+from pmutools.net.routes import Listener, Routes
+from pmutools.net.sockets import RCVBUF_BYTES, Address, allow_open_files
+from pmutools.net.tcp import TcpCounts
 from pmutools.net.udp import Batches, UdpSocket
 
-MAX_STREAMS = 1 << 16
-"""Streams (a flow and an IDCODE) known at once; more come from nowhere but a flood, and are not passed on."""
 HOUSEKEEPING_NS = 1_000_000_000
 NOTHING_NS = 5_000_000_000
 
 
-class Route(NamedTuple):
-    """Where the messages of one stream go: to which endpoints, and who plays the client's part."""
-
-    owners: tuple[int, ...]
-    dialogue: Dialogue
-    link: CommandLink | None
-
-
-class _Listener:
-    """A bound UDP socket and all endpoints that hear through it."""
-
-    def __init__(self, sock: UdpSocket) -> None:
-        self.sock = sock
-        self.by_idcode: dict[int | None, list[tuple[int, Endpoint]]] = {}
-        self.by_host: dict[str, list[CommandLink]] = {}
-        """Links whose data come here, by the host that sends them."""
-        self.drops = sock.own_drops or 0
-
-    @property
-    def owners(self) -> tuple[int, ...]:
-        direct = [index for subscribed in self.by_idcode.values() for index, _ in subscribed]
-        return (*sorted(direct), *(index for links in self.by_host.values() for link in links for index in link.owners))
-
-
 class Receivers:
-    """See the module's text. Not thread-safe; close it, or use it in a ``with``.
+    """See the module's text. Not thread-safe; close it, or use it in a ``with``. Poll it or soak it, not both.
 
     Parameters
     ----------
@@ -88,7 +64,7 @@ class Receivers:
     Raises
     ------
     SourceError
-        A local port is taken or not permitted, a host unknown, a group refused.
+        A local port is taken or not permitted, a host unknown, a group refused; too many endpoints for this process.
     SettingsError
         An endpoint that cannot be received from.
     """
@@ -116,15 +92,11 @@ class Receivers:
         self._out: list[Chunk | LinkEvent] = []
         self._clock = clock
         self._reactor = Reactor(clock)
-        self._plumbing = Plumbing(self._reactor, self._out.append, Batches() if native else None, native, {})
-        self._listeners: dict[tuple[str, int], _Listener] = {}
-        self._by_local: dict[str, _Listener] = {}
-        """By the destination of the flows that come in through them."""
+        self._plumbing = Plumbing(self._reactor, self._out.append, Batches() if native else None, native)
+        self._listeners: dict[tuple[str, int], Listener] = {}
+        self._by_local: dict[str, Listener] = {}
         self._links: list[CommandLink] = []
-        self._routes: dict[Flow, dict[int, Route | None]] = {}
-        self._streams = 0
-        self._held: dict[tuple[Flow, int], int] = {}
-        self._heard: set[int] = set()
+        self.routes = Routes(self.endpoints, self._by_local, self._timing, self._plumbing)
         try:
             self._open()
         except BaseException:
@@ -144,9 +116,7 @@ class Receivers:
     def poll(self, timeout_ns: int | None) -> list[Chunk | LinkEvent]:
         """What has arrived and happened; waits for it at most ``timeout_ns`` (0: not at all, None: for ever)."""
         self._reactor.run(0 if self._out else timeout_ns)
-        out = self._out[:]
-        self._out.clear()
-        return out
+        return self._taken()
 
     def parse(self, item: Chunk | LinkEvent) -> list[Message | Loss]:
         """The messages that a polled item completes, of wanted streams only.
@@ -154,7 +124,10 @@ class Receivers:
         Also moves the conversation on; the news of that come with the next :meth:`poll`.
         """
         if isinstance(item, LinkEvent):
-            return self._end(item.flow) if item.kind in _ENDS and item.flow is not None else []
+            if item.kind not in _ENDS or item.flow is None:
+                return []
+            self.routes.end(item.flow)
+            return self.demux.end(item.flow)
         out: list[Message | Loss] = []
         now_ns = self._clock.monotonic_ns()
         found = self.demux.feed(item)
@@ -162,31 +135,71 @@ class Receivers:
             if isinstance(part, Loss):
                 out.append(part)
                 continue
-            route = self._route(part.flow, part.frame.idcode)
+            route = self.routes.find(part.flow, part.frame.idcode)
             if route is None:
                 self.unwanted += 1
                 continue
-            if route.link is None:
-                route.dialogue.hear(part, now_ns)
-            else:
-                route.link.heard(part, now_ns)
+            route.hear(part, now_ns)
             out.append(part)
-        if not found:
+        if not found and self.demux.put_on_hold:
             self._look_at_held(item.flow, now_ns)
+        elif not found:
+            self.routes.note_noise(item)
+        return out
+
+    def soak(self, timeout_ns: int) -> bool:
+        """Receive for ``timeout_ns`` (0: what is there), or until :meth:`collect` should be called: then it is true.
+
+        That is so where much has come, and where what came may be an answer.
+        """
+        end_ns = self._clock.monotonic_ns() + timeout_ns
+        if self._plumbing.native:
+            return (self._plumbing.intake or self._gather()).run(end_ns)
+        self._reactor.run(0 if self._out else timeout_ns)
+        return bool(self._out)
+
+    def collect(self) -> list[Message | Loss | DataRun | LinkEvent]:
+        """What was received since the last time: of each stream in order, a configuration before what it rules.
+
+        Data frames that came whole, one a datagram or read, come in runs, behind everything else.
+        """
+        out: list[Message | Loss | DataRun | LinkEvent] = []
+        intake = self._plumbing.intake
+        if intake is not None and intake.columns.count:
+            from pmutools.net.harvest import harvest  # numpy is slow to import, and not all who listen need it
+
+            chunks, runs = harvest(intake, self.demux, self.routes)
+            for chunk in chunks:
+                out += self.parse(chunk)
+            now_ns = self._clock.monotonic_ns()
+            for run, route in runs:
+                if not self.demux.take(run):  # what came before it in the round has changed something
+                    out += [part for chunk in run.train.chunks() for part in self.parse(chunk)]
+                elif route is None:
+                    self.unwanted += len(run.train.arrivals_ns)
+                else:
+                    route.hear_alike(run.config, now_ns)
+                    out.append(run)
+            intake.clear()
+        for item in self._taken():
+            if isinstance(item, LinkEvent):
+                out.append(item)
+            out += self.parse(item)
         return out
 
     def finish(self) -> list[Message | Loss]:
-        """The end: what of wanted streams was pending. Own drops not yet told come with the next :meth:`poll`."""
+        """The end: what of wanted streams was pending. News not yet told come with the next :meth:`poll`."""
         self._look_for_drops()
+        self.routes.notices.sum_up(self._clock.monotonic_ns(), end=True)
         return [
             part
             for part in self.demux.close()
-            if isinstance(part, Loss) or self._route(part.flow, part.frame.idcode) is not None
+            if isinstance(part, Loss) or self.routes.find(part.flow, part.frame.idcode) is not None
         ]
 
     def owners(self, flow: Flow, idcode: int) -> tuple[int, ...]:
         """The places of the endpoints that a stream belongs to."""
-        route = self._route(flow, idcode)
+        route = self.routes.find(flow, idcode)
         return route.owners if route is not None else ()
 
     def local(self, index: int) -> Address | None:
@@ -196,6 +209,11 @@ class Receivers:
                 return listener.sock.address
         return None
 
+    def tcp_counts(self, index: int) -> TcpCounts:
+        """What the kernel has counted of the connections of endpoint ``index``; those of several are added up."""
+        counts = [link.tcp_counts() for link in self._links if index in link.owners]
+        return TcpCounts(*map(sum, zip(TcpCounts(), *counts, strict=True)))
+
     def close(self) -> None:
         """Send stop where data were started, and close all sockets."""
         for link in self._links:
@@ -204,6 +222,8 @@ class Receivers:
             listener.sock.close()
         self._links.clear()
         self._listeners.clear()
+        if self._plumbing.intake is not None:
+            self._plumbing.intake.close()
         self._reactor.close()
 
     # --- opening
@@ -212,6 +232,7 @@ class Receivers:
         places: dict[Endpoint, list[int]] = {}
         for index, endpoint in enumerate(self.endpoints):
             places.setdefault(endpoint, []).append(index)
+        allow_open_files(2 * len(places))
         for endpoint, indices in places.items():
             if endpoint.scheme is Scheme.UDP:
                 listener = self._listen(endpoint, endpoint.host, endpoint.port, endpoint.source)
@@ -219,10 +240,11 @@ class Receivers:
             else:
                 self._connect(endpoint, tuple(indices))
         for listener in self._listeners.values():
+            listener.know_owners()
             detail = f"receive buffer {listener.sock.rcvbuf_bytes} bytes"
             self._out.append(LinkEvent(LinkKind.BOUND, f"udp://{listener.sock.address}", listener.owners, detail))
 
-    def _listen(self, endpoint: Endpoint, host: str, port: int, source: str | None) -> _Listener:
+    def _listen(self, endpoint: Endpoint, host: str, port: int, source: str | None) -> Listener:
         host = scoped(host, endpoint.iface)
         key = (host, port)
         listener = self._listeners.get(key) if port else None
@@ -231,12 +253,14 @@ class Receivers:
             sock = UdpSocket(
                 host, port, rcvbuf_bytes=self._rcvbuf_bytes, batches=plumbing.batches, native=plumbing.native
             )
-            listener = _Listener(sock)
+            listener = Listener(sock, self._clock.monotonic_ns())
             self._listeners[host, port or sock.address.port] = listener
             self._by_local[str(sock.address)] = listener
             self._reactor.watch(sock, READ, lambda _, heard=listener: self._read(heard))  # type: ignore[misc]
         if is_multicast(host):
             listener.sock.join(host, iface=endpoint.iface, source=source)
+        if endpoint.hardware_stamps:
+            listener.sock.stamp_by_hardware()
         return listener
 
     def _connect(self, endpoint: Endpoint, owners: tuple[int, ...]) -> None:
@@ -252,98 +276,48 @@ class Receivers:
 
     # --- receiving
 
-    def _read(self, listener: _Listener) -> None:
+    def _taken(self) -> list[Chunk | LinkEvent]:
+        out = self._out[:]
+        self._out.clear()
+        return out
+
+    def _read(self, listener: Listener) -> None:
         try:
             chunks = listener.sock.read()
         except OSError:  # an ICMP error to something sent from here earlier (Windows): nothing was received
             return
         self._out += chunks
 
-    def _route(self, flow: Flow, idcode: int) -> Route | None:
-        routes = self._routes.get(flow)
-        if routes is not None and idcode in routes:
-            return routes[idcode]
-        if self._streams >= MAX_STREAMS:
-            self._forget_unwanted()
-            if self._streams >= MAX_STREAMS:
-                return None
-        self._streams += 1
-        route = self._new_route(flow, idcode)
-        self._routes.setdefault(flow, {})[idcode] = route
-        if route is not None:
-            self._heard.update(route.owners)
-        return route
-
-    def _new_route(self, flow: Flow, idcode: int) -> Route | None:
-        if link := self._plumbing.links.get(flow):
-            return self._link_route(link, link.owners, flow, idcode)
-        listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
-        if listener is None:  # a connection that has ended meanwhile
-            return None
-        host = flow.source.rpartition(":")[0].strip("[]")
-        owners = tuple(
-            index
-            for wanted in (idcode, None)
-            for index, endpoint in listener.by_idcode.get(wanted, ())
-            if endpoint.source in (None, host)
-        )
-        for link in listener.by_host.get(host, ()):
-            if link.idcode in (None, idcode):
-                return self._link_route(link, owners + link.owners, flow, idcode)
-        if not owners:
-            self._tell_of_foreign(listener.owners, flow, idcode)
-            return None
-        role = ClientRole(SPONTANEOUS, self._timing)
-
-        def tell(kind: LinkKind, detail: str) -> None:
-            self._out.append(LinkEvent(kind, f"udp://{flow.source}", owners, detail, idcode, flow))
-
-        dialogue = Dialogue(role, self._reactor, tell)
-        dialogue.step(ClientEvent.OPENED)
-        return Route(owners, dialogue, None)
-
-    def _link_route(self, link: CommandLink, owners: tuple[int, ...], flow: Flow, idcode: int) -> Route | None:
-        if link.idcode not in (None, idcode):
-            self._tell_of_foreign(owners, flow, idcode)
-            return None
-        link.learn(idcode)
-        return Route(owners, link.dialogue, link)
+    def _gather(self) -> Intake:
+        """From now on all sockets are read into columns."""
+        intake = self._plumbing.intake = Intake(self._reactor)
+        for listener in self._listeners.values():
+            sock = listener.sock
+            number = intake.add(sock)
+            if sock.stamps:
+                self._reactor.forget(sock)
+                intake.sweep(sock, Swept(number, sock.rcvbuf_bytes, fail=lambda _: None, awaited=lambda: False))
+            else:  # without a stamp it is the reading that counts
+                read = partial(intake.read, sock, number, stream=False, awaited=False)
+                self._reactor.watch(sock, READ, lambda _, read=read: read())  # type: ignore[misc]
+        for link in self._links:
+            link.listen()
+        return intake
 
     def _look_at_held(self, flow: Flow, now_ns: int) -> None:
         """Data frames that fit no configuration do not come out of the demultiplexer; notice them all the same."""
-        for idcode, nbytes in self.demux.held(flow).items():
-            before = self._held.get((flow, idcode))
-            if nbytes == before:
-                continue
-            if (route := self._route(flow, idcode)) is None:
+        for idcode in self.demux.put_on_hold:
+            if not self.routes.hold(flow, idcode, now_ns):
                 self.unwanted += 1
                 self.demux.ignore(flow, idcode)
-                continue
-            self._held[flow, idcode] = nbytes
-            if before is None:
-                detail = "held until one comes; a spontaneous sender repeats its own about once a minute"
-                where = str(self.endpoints[route.owners[0]])
-                self._out.append(LinkEvent(LinkKind.NO_CONFIG, where, route.owners, detail, idcode, flow))
-            route.dialogue.hear_misfit(now_ns)
-
-    def _end(self, flow: Flow) -> list[Message | Loss]:
-        self._plumbing.links.pop(flow, None)
-        for idcode in self._routes.pop(flow, {}):
-            self._streams -= 1
-            self._held.pop((flow, idcode), None)
-        return self.demux.end(flow)
-
-    def _forget_unwanted(self) -> None:
-        """Too many senders: forget those nobody asked for. Those who still send are met again as new."""
-        for flow in list(self._routes):
-            routes = self._routes[flow]
-            if not any(routes.values()):
-                self._streams -= len(self._routes.pop(flow))
 
     # --- telling
 
     def _keep_house(self) -> None:
+        now_ns = self._clock.monotonic_ns()
         self._look_for_drops()
+        self.routes.look_for_rivals(now_ns)
+        self.routes.notices.sum_up(now_ns)
         self._reactor.call_in(HOUSEKEEPING_NS, self._keep_house)
 
     def _look_for_drops(self) -> None:
@@ -357,15 +331,12 @@ class Receivers:
                 self._out.append(LinkEvent(LinkKind.OWN_DROPS, where, listener.owners, detail, datagrams=lost))
 
     def _tell_of_nothing(self) -> None:
+        noise = {index: heard.noise for heard in self._listeners.values() for index in heard.owners if heard.noise}
         for index, endpoint in enumerate(self.endpoints):
-            if index not in self._heard and endpoint.scheme is Scheme.UDP:
-                detail = "nothing has come; is the sender on, and sending to this address and port?"
-                self._out.append(LinkEvent(LinkKind.NOTHING, str(endpoint), (index,), detail, endpoint.idcode))
-
-    def _tell_of_foreign(self, owners: tuple[int, ...], flow: Flow, idcode: int) -> None:
-        asked = ", ".join(sorted({str(self.endpoints[index]) for index in owners[:3]}))
-        detail = f"IDCODE {idcode} comes from {flow.source}; asked for: {asked}{', ...' if len(owners) > 3 else ''}"
-        self._out.append(LinkEvent(LinkKind.FOREIGN, f"{flow.transport}://{flow.source}", owners, detail, idcode, flow))
+            if index in self.routes.heard or endpoint.scheme is not Scheme.UDP:
+                continue
+            detail = noise.get(index, "nothing has come; is the sender on, and sending to this address and port?")
+            self._out.append(LinkEvent(LinkKind.NOTHING, str(endpoint), (index,), detail, endpoint.idcode))
 
 
 _ENDS = frozenset((LinkKind.LOST, LinkKind.FAILED, LinkKind.UNANSWERED))

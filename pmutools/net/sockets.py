@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from pmutools import linux
 from pmutools.errors import SourceError
+from pmutools.flow import StampSource
 from pmutools.net.endpoint import join_host
 
 RCVBUF_BYTES = 16 << 20
@@ -100,6 +101,31 @@ def explain(error: OSError, where: object) -> SourceError:
     return SourceError(f"{where}: {reason}")
 
 
+SPARE_FILES = 64
+"""Open files that a process needs beside its sockets."""
+
+
+def allow_open_files(count: int) -> None:
+    """Raise this process's limit of open files so that ``count`` sockets fit. Raises SourceError where it may not."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    needed = count + SPARE_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise SourceError(
+            f"{count} sockets: this process may have {hard} files open; raise the limit (ulimit -Hn, LimitNOFILE=) to "
+            f"{needed}, or name fewer endpoints"
+        )
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    except (OSError, ValueError) as error:  # macOS has another limit beside
+        raise SourceError(f"{count} sockets: no more than {soft} files may be open ({error})") from None
+
+
 def raise_rcvbuf(sock: socket.socket, nbytes: int = RCVBUF_BYTES) -> int:
     """Ask for a receive buffer; returns what the kernel gave (Linux gives, and reports, twice the size asked for)."""
     return _raise_buffer(sock, nbytes, linux.SO_RCVBUFFORCE, socket.SO_RCVBUF)
@@ -124,15 +150,35 @@ def _raise_buffer(sock: socket.socket, nbytes: int, force: int, ask: int) -> int
     return sock.getsockopt(socket.SOL_SOCKET, ask)
 
 
-def stamp_arrivals(sock: socket.socket) -> bool:
-    """Have the kernel stamp what arrives (CLOCK_REALTIME); false where it cannot."""
+SETTLING_NS = 1_000_000_000
+"""The kernel begins to stamp some time after the first socket of the machine has asked for it."""
+
+
+def stamp_arrivals(sock: socket.socket, *, hardware: bool = False) -> bool:
+    """Have the kernel stamp what arrives (CLOCK_REALTIME); false where it cannot.
+
+    ``hardware`` asks for the network card's stamps too, which come where the card was told to make them (SIOCSHWTSTAMP,
+    as ``hwstamp_ctl -r 1`` does), in the card's own timescale.
+    """
     if not linux.NATIVE:
         return False
+    all_stamps = linux.RX_HARDWARE | linux.RAW_HARDWARE | linux.RX_SOFTWARE | linux.SOFTWARE
     try:
-        sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPNS, not hardware)  # one control message, not two
+        if hardware:
+            sock.setsockopt(socket.SOL_SOCKET, linux.SO_TIMESTAMPING, all_stamps)
     except OSError:
         return False
     return True
+
+
+def stamp_source(stamp: linux.Stamp, asked_ns: int, *, settling: bool) -> StampSource:
+    """Who took an arrival time, of what was asked for at UTC ``asked_ns``.
+
+    While stamping is ``settling``, what the kernel has not stamped on arrival gets its stamp as it is read.
+    """
+    late = settling and stamp.source is StampSource.KERNEL and stamp.ns >= asked_ns
+    return StampSource.USER if late else stamp.source
 
 
 # --- the kernel's form of an address ----------------------------------------------------------------------------

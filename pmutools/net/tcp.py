@@ -18,7 +18,15 @@ from typing import NamedTuple
 
 from pmutools import linux
 from pmutools.flow import Chunk, Cut, Flow, Segmentation, StampSource
-from pmutools.net.sockets import Address, explain, listening_socket, resolve, stamp_arrivals
+from pmutools.net.sockets import (
+    SETTLING_NS,
+    Address,
+    explain,
+    listening_socket,
+    resolve,
+    stamp_arrivals,
+    stamp_source,
+)
 
 READ_BYTES = 256 << 10
 QUEUE_BYTES = 256 << 10
@@ -30,6 +38,19 @@ KEPT_NS = 10_000_000_000
 _BACKLOG = 1024
 _VANISHED_MS = 30_000
 _LAST_READS = 16
+
+
+class TcpCounts(NamedTuple):
+    """What this end's kernel has counted of connections (TCP_INFO); 0 where it does not tell."""
+
+    retransmits: int = 0
+    """Segments sent again by this end. A receiver sends little: loss on the way to it shows in the other count."""
+    out_of_order: int = 0
+    """Segments that came while an earlier one was missing: it was lost, or overtaken."""
+
+
+_TCP_INFO_BYTES = 228
+_TOTAL_RETRANS, _RCV_OOOPACK = 100, 224
 
 
 class TcpClient:
@@ -45,6 +66,7 @@ class TcpClient:
         local: Address | None = None,
         connection: int = 0,
         native: bool = linux.NATIVE,
+        hardware_stamps: bool = False,
     ) -> None:
         self.address = address
         self.flow = Flow("tcp", str(address), "", connection)
@@ -54,13 +76,15 @@ class TcpClient:
             sock.setblocking(False)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            self.stamps = native and hasattr(sock, "recvmsg_into") and stamp_arrivals(sock)
+            able = native and hasattr(sock, "recvmsg_into")
+            self.stamps = able and stamp_arrivals(sock, hardware=hardware_stamps)
             if local is not None:
                 sock.bind(local.sockaddr)
             error = sock.connect_ex(address.sockaddr)
         except OSError as failure:
             sock.close()
             raise explain(failure, f"tcp://{address}") from None
+        self._settled_ns = time.monotonic_ns() + SETTLING_NS
         self._refused = error if error not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK) else 0
 
     def fileno(self) -> int:
@@ -86,25 +110,38 @@ class TcpClient:
 
     def read(self) -> Chunk | None:
         """What has come, or None; raises OSError when the connection is closed (EPIPE) or broken."""
+        asked_ns = time.time_ns()
         try:
-            size, stamp_ns = self._receive()
+            size, stamp = self._receive()
         except (BlockingIOError, InterruptedError):
             return None
         if not size:
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
         data = bytes(self._buffer[:size])
-        if stamp_ns is None:
+        if stamp is None:
             return Chunk(data, time.time_ns(), self.flow, StampSource.USER)
-        return Chunk(data, stamp_ns, self.flow, StampSource.KERNEL)
+        return Chunk(data, stamp.ns, self.flow, stamp_source(stamp, asked_ns, settling=self._settling()))
 
-    def _receive(self) -> tuple[int, int | None]:
+    def counts(self) -> TcpCounts:
+        """What the kernel tells of this connection so far."""
+        try:
+            info = self._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES) if linux.NATIVE else b""
+        except OSError:
+            info = b""
+        if len(info) < _TCP_INFO_BYTES:
+            return TcpCounts()
+        return TcpCounts(*(struct.unpack_from("=I", info, at)[0] for at in (_TOTAL_RETRANS, _RCV_OOOPACK)))
+
+    def _settling(self) -> bool:
+        return time.monotonic_ns() < self._settled_ns
+
+    def _receive(self) -> tuple[int, linux.Stamp | None]:
         if not self.stamps:
             return self._sock.recv_into(self._buffer), None
         size, control, _flags, _sender = self._sock.recvmsg_into([self._buffer], 128)
         for level, kind, value in control:
-            if level == socket.SOL_SOCKET and kind == linux.SO_TIMESTAMPNS:
-                seconds, nanoseconds = struct.unpack("@qq", value)
-                return size, seconds * 1_000_000_000 + nanoseconds
+            if level == socket.SOL_SOCKET and (stamp := linux.arrival_stamp(kind, value)) is not None:
+                return size, stamp
         return size, None
 
     def send(self, frame: bytes) -> bool:

@@ -22,6 +22,7 @@ from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.net.endpoint import is_multicast
 from pmutools.net.sockets import (
     RCVBUF_BYTES,
+    SETTLING_NS,
     Address,
     explain,
     pack_sockaddr,
@@ -29,6 +30,7 @@ from pmutools.net.sockets import (
     raise_sndbuf,
     resolve,
     stamp_arrivals,
+    stamp_source,
     unpack_sockaddr,
 )
 
@@ -123,6 +125,9 @@ class UdpSocket:
             sock.close()
             raise explain(error, f"udp://{wanted}") from None
         self.address = Address(wanted.family, sock.getsockname())
+        self.name_bytes = len(pack_sockaddr(self.address))
+        """Size of a sender's address in the kernel's form."""
+        self._settled_ns = time.monotonic_ns() + SETTLING_NS
         self._flows: dict[bytes | tuple[str, int], Flow] = {}
         self._stamps_departures = False
 
@@ -172,18 +177,33 @@ class UdpSocket:
         if self._batches is None:
             return self._read_portable()
         chunks: list[Chunk] = []
-        receive, fd = self._batches.receive, self._sock.fileno()
+        receive, fd, settling = self._batches.receive, self._sock.fileno(), self._settling()
         for _ in range(READ_BATCHES):
+            asked_ns = time.time_ns()
             datagrams = receive.receive(fd)
-            for data, sockaddr, stamp_ns in datagrams:
-                flow = self._flows.get(sockaddr) or self._new_flow(sockaddr, unpack_sockaddr(sockaddr))
-                if stamp_ns is None:
+            for data, sockaddr, stamp in datagrams:
+                flow = self.flow_from(sockaddr)
+                if stamp is None:
                     chunks.append(Chunk(data, time.time_ns(), flow, StampSource.USER))
                 else:
-                    chunks.append(Chunk(data, stamp_ns, flow, StampSource.KERNEL))
+                    chunks.append(Chunk(data, stamp.ns, flow, stamp_source(stamp, asked_ns, settling=settling)))
             if len(datagrams) < receive.size:
                 break
         return chunks
+
+    def flow_from(self, sockaddr: bytes) -> Flow:
+        """The flow of what a sender, in the kernel's form, sends here."""
+        return self._flows.get(sockaddr) or self._new_flow(sockaddr, unpack_sockaddr(sockaddr))
+
+    def stamp_by_hardware(self) -> None:
+        """Take the network card's stamps from now on, where there are any, else the kernel's."""
+        if self.stamps:
+            self.stamps = stamp_arrivals(self._sock, hardware=True)
+
+    def _settling(self) -> bool:
+        if self._settled_ns and time.monotonic_ns() >= self._settled_ns:
+            self._settled_ns = 0
+        return self._settled_ns > 0
 
     def _read_portable(self) -> list[Chunk]:
         chunks: list[Chunk] = []

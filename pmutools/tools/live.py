@@ -3,33 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
-from pmutools.c37118.demux import Loss, Message
+from pmutools.c37118.demux import DataRun, Loss, Message
 from pmutools.clock import Clock, SystemClock
+from pmutools.errors import SettingsError
 from pmutools.flow import Chunk, Flow
 from pmutools.formats.source import Block, Gatherer, gather
+from pmutools.host import ClockStep, Heartbeat, HostLog, Stall
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint, parse_endpoint
 from pmutools.net.receiver import Receivers
 from pmutools.net.sockets import RCVBUF_BYTES
+from pmutools.net.tcp import TcpCounts
 from pmutools.sites import Site
 
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
 ROUND_NS = 250_000_000
 """How long data frames are gathered before they are handed on."""
+ROUND_FRAMES = 1 << 16
+"""So many data frames are handed on before their round is over."""
+CONFIG_FRAMES = 100_000
+"""Frames of a saved configuration's recording that are looked through for it."""
 
 
 class LiveSource:
     """Endpoints as a source: bound when made, read by iterating, closed by leaving the ``with``.
 
-    ``tell`` is given the news of connections. Iteration ends ``duration_ns`` after the source was made, or when
-    ``stop``, asked every 0.1 s, says so. Raises SourceError where an endpoint cannot be opened, SettingsError for a
-    URL that is none.
+    ``tell`` is given the news of connections, ``tell_host`` those of this machine. Iteration ends ``duration_ns`` after
+    the source was made, or when ``stop``, asked every 0.1 s, says so. CFG-3 is asked for, and after a second of silence
+    CFG-2; with ``want_cfg3`` false, only that. Sites bring their saved configurations, other streams take ``configs``.
+
+    Raises SourceError where an endpoint cannot be opened or a saved configuration not be read, SettingsError for a URL
+    that is none and for saved configurations that contradict each other.
     """
 
     kind = "live"
@@ -40,7 +52,9 @@ class LiveSource:
         *,
         duration_ns: int | None = None,
         configs: Iterable[StreamConfig] = (),
+        want_cfg3: bool = True,
         tell: Callable[[LinkEvent], None] | None = None,
+        tell_host: Callable[[Stall | ClockStep], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
         clock: Clock | None = None,
         rcvbuf_bytes: int = RCVBUF_BYTES,
@@ -50,13 +64,17 @@ class LiveSource:
         endpoints = [_endpoint(url) for url in urls]
         self.path = Path(str(endpoints[0]) if len(endpoints) == 1 else f"{len(endpoints)} endpoints")
         self.clock = clock or SystemClock()
-        self.receivers = Receivers(endpoints, self.clock, configs=configs, rcvbuf_bytes=rcvbuf_bytes)
+        saved = (*configs, *saved_configs(site for site in self.sites if site is not None))
+        self.receivers = Receivers(endpoints, self.clock, configs=saved, want_cfg3=want_cfg3, rcvbuf_bytes=rcvbuf_bytes)
         self.tally = self.receivers.demux.tally
         self.own_drops = 0
         """Datagrams lost in this machine's receive buffers: not the network's doing."""
-        self._tell, self._stop = tell, stop
+        self.host = HostLog(self.clock)
+        """How this machine stood still and had its clock set, while reading, by the machine's own clock."""
+        self._tell, self._tell_host, self._stop = tell, tell_host, stop
         started_ns = self.clock.monotonic_ns()
-        self._end_ns = None if duration_ns is None else started_ns + duration_ns
+        self.end_ns = None if duration_ns is None else started_ns + duration_ns
+        """When reading ends, by the monotonic clock; None: when it is stopped."""
 
     def __enter__(self) -> LiveSource:
         return self
@@ -68,8 +86,9 @@ class LiveSource:
 
     def polls(self) -> Iterator[list[Message | Loss]]:
         """What came, poll by poll, an empty list at least every 0.1 s; the last ones hold what was pending."""
-        while (left_ns := self._left_ns()) > 0 and not self._stop():
-            yield self._poll(min(POLL_NS, left_ns))
+        with self._heartbeat():
+            while (left_ns := self._left_ns()) > 0 and not self._stop():
+                yield self._poll(min(POLL_NS, left_ns))
         yield self._poll(0)
         yield self.receivers.finish()
         yield self._poll(0)  # the news of the end
@@ -78,36 +97,67 @@ class LiveSource:
         found: list[Message | Loss] = []
         for item in self.receivers.poll(timeout_ns):
             if not isinstance(item, Chunk):
-                self.own_drops += item.datagrams
-                if self._tell is not None:
-                    self._tell(item)
+                self._take_news(item)
             found += self.receivers.parse(item)
+        self._take_host_news()
         return found
 
     def rounds(self, round_ns: int = ROUND_NS) -> Iterator[list[Block | Message | Loss]]:
         """What came, gathered for ``round_ns``: a block a stream of data frames, in order; other frames; losses.
 
-        A configuration frame comes before the blocks that it rules, and an empty list where nothing came.
+        A configuration frame comes after the blocks that were ruled by what held before it, and before those that it
+        rules. A list is empty where nothing came, and comes early, with several blocks a stream, where there is much:
+        no more than some :data:`ROUND_FRAMES` frames wait.
         """
         gatherer = Gatherer()
         out: list[Block | Message | Loss] = []
         due_ns = self.clock.monotonic_ns() + round_ns
-        for found in self.polls():
-            for item in found:
-                if isinstance(item, Loss) or item.frame.type is not FrameType.DATA:
-                    out.append(item)
-                elif (block := gatherer.add(item)) is not None:
-                    out.append(block)
-            if (now_ns := self.clock.monotonic_ns()) >= due_ns:
-                due_ns = now_ns + round_ns
-                yield [*out, *gatherer.flush()]
-                out = []
+        with self._heartbeat():
+            while (left_ns := self._left_ns()) > 0 and not self._stop():
+                wait_ns = max(due_ns - self.clock.monotonic_ns(), 0)
+                early = self.receivers.soak(min(POLL_NS, left_ns, wait_ns))
+                due = self.clock.monotonic_ns() >= due_ns
+                if early or due:
+                    self._gather(self.receivers.collect(), gatherer, out)
+                if due or gatherer.waiting >= ROUND_FRAMES:
+                    due_ns = self.clock.monotonic_ns() + round_ns
+                    yield [*out, *gatherer.flush()]
+                    out = []
+        self.receivers.soak(0)
+        self._gather(self.receivers.collect(), gatherer, out)
+        self._gather(self.receivers.finish(), gatherer, out)
+        self._gather(self.receivers.collect(), gatherer, out)  # the news of the end
         yield [*out, *gatherer.flush()]
+
+    def _gather(
+        self,
+        found: Iterable[Message | Loss | DataRun | LinkEvent],
+        gatherer: Gatherer,
+        out: list[Block | Message | Loss],
+    ) -> None:
+        for item in found:
+            if isinstance(item, LinkEvent):
+                self._take_news(item)
+            elif isinstance(item, DataRun):
+                if (block := gatherer.add_run(item)) is not None:
+                    out.append(block)
+            elif isinstance(item, Message) and item.frame.type is FrameType.DATA:
+                if (block := gatherer.add(item)) is not None:
+                    out.append(block)
+            else:
+                if isinstance(item, Message) and item.frame.type.rules_data:
+                    out += gatherer.flush(item.frame.idcode)
+                out.append(item)
+        self._take_host_news()
 
     def site(self, flow: Flow, idcode: int) -> Site | None:
         """The site that a stream belongs to; None where it was named by its URL only."""
         owners = self.receivers.owners(flow, idcode)
         return next((self.sites[index] for index in owners if self.sites[index] is not None), None)
+
+    def tcp_counts(self, index: int) -> TcpCounts:
+        """What this machine's kernel has counted so far of the connections of the endpoint at place ``index``."""
+        return self.receivers.tcp_counts(index)
 
     def items(self) -> Iterator[Message | Loss]:
         for found in self.polls():
@@ -120,10 +170,66 @@ class LiveSource:
         return {"datagrams lost in this machine's receive buffer": self.own_drops} if self.own_drops else {}
 
     def _left_ns(self) -> int:
-        return POLL_NS if self._end_ns is None else self._end_ns - self.clock.monotonic_ns()
+        return POLL_NS if self.end_ns is None else self.end_ns - self.clock.monotonic_ns()
+
+    @contextmanager
+    def _heartbeat(self) -> Iterator[None]:
+        """Watch this machine, where its own clock is the clock."""
+        if not isinstance(self.clock, SystemClock):
+            yield
+            return
+        heartbeat = Heartbeat(self.host)
+        try:
+            yield
+        finally:
+            heartbeat.stop()
+
+    def _take_news(self, event: LinkEvent) -> None:
+        self.own_drops += event.datagrams
+        if self._tell is not None:
+            self._tell(event)
+
+    def _take_host_news(self) -> None:
+        for event in self.host.news():
+            if self._tell_host is not None:
+                self._tell_host(event)
 
 
 def _endpoint(url: str | Endpoint | Site) -> Endpoint:
     if isinstance(url, Site):
         return url.endpoint
     return parse_endpoint(url) if isinstance(url, str) else url
+
+
+def saved_configs(sites: Iterable[Site]) -> list[StreamConfig]:
+    """The configurations in the recordings that ``sites`` name; of a site with an IDCODE that one's only.
+
+    Raises SourceError for a file that cannot be read, SettingsError where it lacks the configuration, or has another
+    than another site's.
+    """
+    found: dict[int, tuple[StreamConfig, Site]] = {}
+    for site in sites:
+        for config in _configs_of(site) if site.config is not None else ():
+            known, other = found.setdefault(config.idcode, (config, site))
+            if known != config:
+                raise SettingsError(
+                    f"[pmu {site.name}] config: {site.config} describes IDCODE {config.idcode} in another way than "
+                    f"{other.config} of [pmu {other.name}]; give them the same file"
+                )
+    return [config for config, _ in found.values()]
+
+
+def _configs_of(site: Site) -> list[StreamConfig]:
+    from pmutools.formats import open_source  # opening one imports its format
+
+    assert site.config is not None
+    found: dict[int, StreamConfig] = {}
+    for item in islice(open_source(site.config).items(), CONFIG_FRAMES):
+        if isinstance(item, Message) and item.config is not None and item.frame.type.rules_data:
+            found[item.frame.idcode] = item.config
+            if item.frame.idcode == site.stream:
+                return [item.config]
+    if site.stream is not None or not found:
+        wanted = "no configuration" if site.stream is None else f"no configuration of IDCODE {site.stream}"
+        raise SettingsError(f"[pmu {site.name}] config: {site.config} holds {wanted}; name a recording that does")
+    return list(found.values())

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 from bench.stopwatch import Rate
 
-Group = Literal["codec", "capture", "start-up", "control", "measure", "read", "player"]
+Group = Literal["codec", "capture", "start-up", "control", "measure", "live", "player"]
 BINDING: tuple[Group, ...] = ("codec", "capture", "start-up")
 """A missed budget of these groups is a failure."""
 HEAD = ("what", "ours", "against", "result", "budget", "")
