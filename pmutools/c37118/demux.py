@@ -114,6 +114,8 @@ class _FlowState:
         self.configs: dict[int, StreamConfig] = {}
         self.fitting: dict[bytes, StreamConfig] = {}
         """The same by the first six bytes of data frames that they fit (SYNC, FRAMESIZE, IDCODE): the short way."""
+        self.heads: dict[int, list[bytes]] = {}
+        """These first bytes, by IDCODE."""
         self.borrowed: set[int] = set()
         """IDCODEs whose configuration another flow has shown."""
         self.held: dict[int, _Held] = {}
@@ -123,6 +125,17 @@ class _FlowState:
         self.early_bytes = 0
         self.fresh = True
         """Whether it was fed since a flow to end was last looked for."""
+
+
+    def fit(self, head: bytes, config: StreamConfig) -> None:
+        """Frames that begin with ``head`` are read by ``config`` from now on."""
+        self.fitting[head] = config
+        self.heads.setdefault(config.idcode, []).append(head)
+
+    def unfit(self, idcode: int) -> None:
+        """The stream has another configuration now, or none."""
+        for head in self.heads.pop(idcode, ()):
+            del self.fitting[head]
 
 
 def _all_good(train: Train) -> bool:
@@ -285,7 +298,7 @@ class Demux:
                     self._hold(state, item, out)
                     return
             else:
-                state.fitting[item.data[:6]] = config
+                state.fit(item.data[:6], config)
             self._emit(Message(item, state.flow, config), kind, out)
         elif kind.is_config:
             self._configure(state, item, kind, out)
@@ -334,12 +347,12 @@ class Demux:
         place = (state.host, config.idcode)
         if current is None or current != config:
             state.configs[config.idcode] = config
-            state.fitting.clear()
+            state.unfit(config.idcode)
             state.borrowed.discard(config.idcode)
             for other in self._borrowers.pop(place, {}).values():  # they look again
                 if config.idcode in other.borrowed:
                     del other.configs[config.idcode]
-                    other.fitting.clear()
+                    other.unfit(config.idcode)
                     other.borrowed.discard(config.idcode)
         self._configs.setdefault(place, {})[state.flow] = state.configs[config.idcode]
         for other in list(self._waiting.get(place, {}).values()):
