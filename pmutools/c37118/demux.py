@@ -123,9 +123,8 @@ class _FlowState:
         self.proven = False
         self.early: list[Skipped] = []
         self.early_bytes = 0
-        self.fresh = True
-        """Whether it was fed since a flow to end was last looked for."""
-
+        self.fresh = False
+        """Whether it was fed again since it was met, or since a flow to end was last looked for."""
 
     def fit(self, head: bytes, config: StreamConfig) -> None:
         """Frames that begin with ``head`` are read by ``config`` from now on."""
@@ -171,7 +170,8 @@ class Demux:
             if len(self._flows) >= FLOWS:
                 out += self.end(self._silent_flow())
             state = self._flows[flow] = _FlowState(flow)
-        state.fresh = True
+        else:
+            state.fresh = True
         if self.put_on_hold:
             self.put_on_hold.clear()
         tally = self.tally

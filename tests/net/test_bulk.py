@@ -14,7 +14,7 @@ import pytest
 from support.live import CLOCK, data_frame, stream
 
 from pmutools import linux
-from pmutools.c37118 import Command, FrameType, StreamConfig, encode_command, encode_config, encode_header
+from pmutools.c37118 import Command, StreamConfig, encode_command, encode_config, encode_header
 from pmutools.c37118.demux import DataRun, Loss, Message, Tally
 from pmutools.flow import Flow, StampSource
 from pmutools.net import sorting
@@ -124,7 +124,8 @@ class World:
 
     def _config(self, idcode: int) -> StreamConfig:
         phasors = self.rng.choice((1, 1, 1, 2, 400))  # the last one's frames are longer than a row
-        return replace(stream(idcode, phasors=phasors, cfgcnt=self.rng.randint(0, 3)), data_rate=self.rng.choice((50, 60)))
+        config = stream(idcode, phasors=phasors, cfgcnt=self.rng.randint(0, 3))
+        return replace(config, data_rate=self.rng.choice((50, 60)))
 
     def next(self) -> tuple[int, bytes]:
         """A sender and its datagram."""

@@ -33,6 +33,7 @@ def endpoints(draw: st.DrawFn) -> Endpoint:
         data_host=draw(st.none() | hosts) if over_udp else None,
         data_port=draw(ports) if over_udp else None,
         ttl=draw(st.none() | st.integers(0, 255)),
+        hardware_stamps=draw(st.booleans()),
     )
 
 
@@ -50,6 +51,8 @@ def test_a_url_comes_back(endpoint: Endpoint) -> None:
         ("tcp://[2001:db8::1]:4712?idcode=7", Endpoint(Scheme.TCP, "2001:db8::1", 4712, idcode=7)),
         ("tcp+udp://h:1?data=2", Endpoint(Scheme.TCP_UDP, "h", 1, data_port=2)),
         ("tcp+udp://h:1?data=[ff02::9]:2", Endpoint(Scheme.TCP_UDP, "h", 1, data_host="ff02::9", data_port=2)),
+        ("tcp://h:1?stamps=hardware", Endpoint(Scheme.TCP, "h", 1, hardware_stamps=True)),
+        ("tcp://h:1?stamps=kernel", Endpoint(Scheme.TCP, "h", 1)),
         (
             "udp://239.0.0.1:4713?iface=10.0.0.2&source=10.0.0.1&ttl=3",
             Endpoint(Scheme.UDP, "239.0.0.1", 4713, iface="10.0.0.2", source="10.0.0.1", ttl=3),
@@ -83,6 +86,7 @@ def test_urls(url: str, endpoint: Endpoint) -> None:
         ("tcp://h:1?idcode=65535", "1..65534"),
         ("tcp://h:1?idcode=7a", "1..65534"),
         ("udp://h:1?ttl=256", "0..255"),
+        ("udp://h:1?stamps=card", "neither kernel nor hardware"),
         ("udp://h:1?source=pmu1", "not an IP address"),
         ("tcp+udp://h:1", "add ?data=PORT"),
         ("tcp+udp://h:1?data=x", "not a port"),
