@@ -26,7 +26,7 @@ LONGEST_US = 1 << 26
 BINS = loglinear.bin_of(LONGEST_US, BITS) + 1
 """Bins of delays since the start: up to 67 s, each to 6 % of itself."""
 SHARES = (0.5, 0.99)
-REFRESHED = 512
+REFRESHED = 64
 """Streams whose percentiles are renewed at once, or a quarter of them all, if that is more."""
 _MS = 1e6
 _MIDDLES_MS = np.array([(loglinear.low(b, BITS) + loglinear.high(b, BITS)) / 2e3 for b in range(BINS)], np.float32)
@@ -110,12 +110,19 @@ class Recent(Table):
         """Places, the oldest first."""
         return (self.at + 1 - self.used + np.arange(self.used)) % PLACES
 
-    def window(self, length_ns: int) -> tuple[npt.NDArray[np.intp], int]:
-        """Places within the last ``length_ns``, and the time that the one before them ended."""
+    def within(self, length_ns: int) -> npt.NDArray[np.intp]:
+        """Places of the last ``length_ns``, the oldest first."""
         order = self.order()
         ended_ns = self.ended_ns[order]
-        inside = max(1, int(np.searchsorted(ended_ns, ended_ns[-1] - length_ns, side="right")))
-        return order[inside:], int(ended_ns[inside - 1])
+        recent: npt.NDArray[np.intp] = order[ended_ns > ended_ns[-1] - length_ns]
+        return recent
+
+    def passed(self, length_ns: int) -> tuple[npt.NDArray[np.intp], int]:
+        """The same, but for the very first, which began nobody knows when; and when the one before them ended."""
+        places, order = self.within(length_ns), self.order()
+        if len(places) == len(order):
+            places = places[1:]
+        return places, int(self.ended_ns[order[-1 - len(places)]])
 
     # --- frames
 
@@ -177,7 +184,7 @@ class Recent(Table):
     def _renew(self, rows: npt.NDArray[np.intp]) -> None:
         if not len(rows):
             return
-        places, _ = self.window(RECENT_NS)
+        places = self.within(RECENT_NS)
         recent = self.unique[rows][:, places].sum(1, dtype=np.int64)
         delays = self.delays[rows]
         count = np.minimum(np.minimum(recent, delays), DELAYS)

@@ -128,13 +128,12 @@ class Watch:
         shown = np.flatnonzero(live.state[: len(self)] != HIDDEN)
         if recent.begun_ns is None:
             recent.pass_time(now_ns)
-        places, _ = recent.window(RECENT_NS)
+        places = recent.within(RECENT_NS)
         sums = {name: getattr(recent, name)[shown][:, places].sum(1, dtype=np.int64) for name in Recent.COUNTS}
         loss = np.clip(1 - shares(sums["unique"], sums["expected"]), 0, 1)
         order = recent.order()
         p50, p99, most, all_p50, all_p99 = recent.percentiles_ms[shown].T
-        fresh = np.isnan(p50) & (recent.delays[shown] > 0)
-        if fresh.any():
+        if (np.isnan(all_p50) & (recent.delays[shown] > 0)).any():  # their turn has not come yet
             recent.refresh_all(len(self))
             p50, p99, most, all_p50, all_p99 = recent.percentiles_ms[shown].T
         rate = self._rate(shown, NS, now_ns)
@@ -288,7 +287,7 @@ class Watch:
     def _rate(self, shown: npt.NDArray[np.intp], length_ns: int, now_ns: int) -> npt.NDArray[np.float64]:
         """Frames a second over the last ``length_ns``, or since the stream began if that is later."""
         recent, live = self._recent, self._live
-        places, since_ns = recent.window(length_ns)
+        places, since_ns = recent.passed(length_ns)
         frames = recent.frames[shown][:, places].sum(1, dtype=np.int64)
         until_ns = max(int(recent.ended_ns[recent.at]), since_ns)
         if now_ns - until_ns > length_ns:
