@@ -74,11 +74,11 @@ class StreamBatch:
         quantity, at = place
         if quantity == "phasor":
             return self.batch.phasors[:, at]
-        return quantities(self.batch, "rect")[quantity][:, at]
+        return quantities(self.batch, "rect", (quantity,))[quantity][:, at]
 
     def to_arrow(self, phasors: str = "polar") -> Any:
         """A pyarrow.RecordBatch with the columns of the tables that ``pmu read`` writes; phasors polar or rect."""
-        from pmutools.formats.table import wide_rows
+        from pmutools.formats.table_rows import wide_rows
 
         return wide_rows(self.batch, "rect" if phasors == "rect" else "polar")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
@@ -12,7 +11,6 @@ from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import DataRun, Loss, Message
 from pmutools.clock import Clock, SystemClock
-from pmutools.errors import SettingsError
 from pmutools.flow import Chunk, Flow
 from pmutools.formats.source import Block, Gatherer, gather
 from pmutools.host import ClockStep, Heartbeat, HostLog, Stall
@@ -22,6 +20,7 @@ from pmutools.net.receiver import Receivers
 from pmutools.net.sockets import RCVBUF_BYTES
 from pmutools.net.tcp import TcpCounts
 from pmutools.sites import Site
+from pmutools.tools.recordings import saved_configs
 
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
@@ -29,8 +28,6 @@ ROUND_NS = 250_000_000
 """How long data frames are gathered before they are handed on."""
 ROUND_FRAMES = 1 << 16
 """So many data frames are handed on before their round is over."""
-CONFIG_FRAMES = 100_000
-"""Frames of a saved configuration's recording that are looked through for it."""
 
 
 class LiveSource:
@@ -199,37 +196,3 @@ def _endpoint(url: str | Endpoint | Site) -> Endpoint:
     if isinstance(url, Site):
         return url.endpoint
     return parse_endpoint(url) if isinstance(url, str) else url
-
-
-def saved_configs(sites: Iterable[Site]) -> list[StreamConfig]:
-    """The configurations in the recordings that ``sites`` name; of a site with an IDCODE that one's only.
-
-    Raises SourceError for a file that cannot be read, SettingsError where it lacks the configuration, or has another
-    than another site's.
-    """
-    found: dict[int, tuple[StreamConfig, Site]] = {}
-    for site in sites:
-        for config in _configs_of(site) if site.config is not None else ():
-            known, other = found.setdefault(config.idcode, (config, site))
-            if known != config:
-                raise SettingsError(
-                    f"[pmu {site.name}] config: {site.config} describes IDCODE {config.idcode} in another way than "
-                    f"{other.config} of [pmu {other.name}]; give them the same file"
-                )
-    return [config for config, _ in found.values()]
-
-
-def _configs_of(site: Site) -> list[StreamConfig]:
-    from pmutools.formats import open_source  # opening one imports its format
-
-    assert site.config is not None
-    found: dict[int, StreamConfig] = {}
-    for item in islice(open_source(site.config).items(), CONFIG_FRAMES):
-        if isinstance(item, Message) and item.config is not None and item.frame.type.rules_data:
-            found[item.frame.idcode] = item.config
-            if item.frame.idcode == site.stream:
-                return [item.config]
-    if site.stream is not None or not found:
-        wanted = "no configuration" if site.stream is None else f"no configuration of IDCODE {site.stream}"
-        raise SettingsError(f"[pmu {site.name}] config: {site.config} holds {wanted}; name a recording that does")
-    return list(found.values())

@@ -7,6 +7,7 @@ killed, up to the last flush. Memory: a row group of 65,536 rows.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +16,10 @@ import numpy.typing as npt
 
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES
+from pmutools.errors import SourceError
+from pmutools.formats import JOURNAL
 from pmutools.formats.output import OutputFile
 from pmutools.formats.parquet import ParquetRows
-from pmutools.formats.sink import SinkOptions
 from pmutools.measure.stream import STATES, Seen, State
 from pmutools.tools.characterizer.gauge import Gauge
 
@@ -38,7 +40,8 @@ class Samples:
         self.path = folder / NAME
         self._schema = _schema()
         self._file = OutputFile(self.path)
-        self._rows = ParquetRows(self._file, self._schema, SinkOptions(journal=True))
+        self._rows = ParquetRows(self._file, self._schema)
+        self._journal = _Journal(self.path.with_name(NAME + JOURNAL), self._schema)
         self._names: list[str] = []
         self._waiting: list[tuple[npt.NDArray[Any], ...]] = []
         self._count = 0
@@ -87,22 +90,55 @@ class Samples:
             words(columns["source"], [str(source) for source in STAMP_SOURCES]),
             words(columns["state"], [str(state) for state in STATES]),
         ]
-        self._rows.write(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        rows = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
+        self._journal.write(rows)
+        self._rows.write(rows)
 
     def flush(self) -> None:
         """What came so far can be read, whatever happens."""
         if self._waiting:
             self._hand_on()
-        self._rows.flush()
+        self._journal.flush()
 
     def close(self) -> None:
-        """Finish the file; the journal goes."""
+        """Finish the file; the journal goes, unless the file could not be finished."""
         try:
             if self._waiting:
                 self._hand_on()
             self._rows.close()
-        finally:
             self._file.close()
+        except SourceError:
+            self._journal.close()
+            with suppress(SourceError):
+                self._file.close()
+            raise
+        self._journal.discard()
+
+
+class _Journal:
+    """The rows as they come, an Arrow stream."""
+
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        import pyarrow as pa
+
+        self._file = OutputFile(path)
+        self._stream: Any = pa.ipc.new_stream(self._file, schema)
+
+    def write(self, rows: pa.RecordBatch) -> None:
+        self._stream.write_batch(rows)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        with suppress(SourceError):
+            self._stream.close()
+            self._file.close()
+
+    def discard(self) -> None:
+        self.close()
+        with suppress(OSError):
+            self._file.final_path.unlink()
 
 
 def _schema() -> pa.Schema:

@@ -64,7 +64,7 @@ class Reading:
             if isinstance(item, Block):
                 self._count_block(item)
             elif isinstance(item, Loss):
-                reason, _, nbytes = item.skipped
+                reason, nbytes = item.skipped.reason, item.skipped.nbytes
                 self.skipped[str(reason)] += nbytes
                 self.skipped_by_flow.setdefault(flow_name(item), Counter())[str(reason)] += nbytes
             elif item.frame.type is FrameType.DATA:  # pragma: no cover - rounds give data as blocks
