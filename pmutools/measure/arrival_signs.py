@@ -69,11 +69,12 @@ def _reconnects(scene: Scene) -> str | None:
 
 def _retransmits(scene: Scene) -> str | None:
     events, received = scene.result.counts.events, scene.result.counts.slots.received
-    if events.retransmits < max(3, received / 1000):
+    if events.retransmits + events.out_of_order < max(3, received / 1000):
         return None
     return (
-        f"TCP sent {events.retransmits} segments again: the path loses packets, and TCP turns each loss into a delay "
-        "of this frame and of all behind it"
+        f"{events.out_of_order} segments of TCP came while an earlier one was missing, and {events.retransmits} had to "
+        "be sent again from here: the path loses packets, and TCP turns each loss into a delay of this frame and of "
+        "all behind it"
     )
 
 
@@ -176,7 +177,7 @@ ROWS: tuple[Row, ...] = (
     Row("own-drops", "the receiver's socket buffer overflowed", _own_drops),
     Row("host-stalls", "the measuring process stood still", _stalls),
     Row("reconnects", "a connection that was lost, a sender that began anew", _reconnects),
-    Row("retransmissions", "3 or more, and 1 of 1000 frames or more", _retransmits),
+    Row("tcp-losses", "segments out of order or sent again: 3, and 1 of 1000 frames, or more", _retransmits),
     Row("pauses", "a second of frames in a row missing, or no arrival for 10 s", _pauses),
     Row("multicast-ageing", "a multicast stream falls silent 180 to 330 s after its start", _ageing),
     Row("tcp-batching", "frames share a TCP read, or come in bursts over TCP", _batching),

@@ -6,6 +6,7 @@ from pmutools.c37118.constants import Format, Stat, stat_trigger_reason
 from pmutools.measure.scene import ENOUGH, Row, Scene
 from pmutools.timebase import NS
 
+_ENOUGH_STEPS = 30
 NO_TIME_BASE = 0xFFFFFF
 """All bits of TIME_BASE: a default, more likely than a clock of 16.8 MHz."""
 
@@ -60,6 +61,12 @@ def _rate(scene: Scene) -> str | None:
     if steps.count >= ENOUGH and (step := steps.quantile(0.5) or 1) > 1 and steps.quantile(0.1) == step:
         return (
             f"frames come for every {step}th reporting instant: the device sends {rate / step:g}/s, its "
+            f"configuration says {rate:g}/s"
+        )
+    if steps.count >= _ENOUGH_STEPS and (steps.quantile(0.02) or 1) > 1:
+        told = rate * slots.received / slots.expected
+        return (
+            f"no two reporting instants in a row were ever filled: the device sends about {told:.3g}/s, its "
             f"configuration says {rate:g}/s"
         )
     if slots.conflicting > 0.2 * slots.frames and slots.off_grid > 0.2 * slots.frames and slots.expected:

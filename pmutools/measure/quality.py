@@ -235,7 +235,9 @@ class Events(Counts):
     senders: int = field(default=0, metadata=LARGEST)
     """Most senders heard at once; 2 are one too many."""
     retransmits: int = 0
-    """Of TCP, as the receiver's kernel counts them."""
+    """Segments that this end of TCP sent again, as its kernel counts them."""
+    out_of_order: int = 0
+    """Segments of TCP that came while an earlier one was missing: it was lost, or overtaken."""
     stalls: int = 0
     """Times that the measuring host stood still for more than 50 ms."""
     longest_stall_ms: float = field(default=0.0, metadata=LARGEST)

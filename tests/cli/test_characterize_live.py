@@ -197,9 +197,9 @@ def test_a_full_disk_is_told_and_the_rest_is_measured(
     sender: tuple[int, Plan], small_disk: Path, tmp_path: Path
 ) -> None:
     port, out = sender[0], small_disk / "run"
-    with started("characterize", f"udp://127.0.0.1:{port}", "--out", out, "--duration", 4, "--no-report") as running:
+    with started("characterize", f"udp://127.0.0.1:{port}", "--out", out, "--no-report") as running:
         wait_for_udp(port, running)
-        time.sleep(1.5)
+        time.sleep(1.5)  # something is written before
         ballast = small_disk / "ballast"
         with ballast.open("wb", buffering=0) as file:
             try:
@@ -207,13 +207,16 @@ def test_a_full_disk_is_told_and_the_rest_is_measured(
                     file.write(bytes(4096))
             except OSError:
                 pass
-        time.sleep(1.5)
+        deadline = time.monotonic() + 20
+        while (out / "samples.parquet").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
         ballast.unlink()
+        running.send_signal(signal.SIGINT)
         result = ended(running)
-    assert result.code == 1
+    assert result.code == 130
     assert "samples.parquet" in result.err and "No space left on device" in result.err
     summary = told(out)
-    assert summary["streams"][0]["received"] > 100
+    assert summary["streams"][0]["received"] > 60
     assert any("No space left" in line for _, line in summary["run"]["news"])
     assert not (out / "samples.parquet").exists()
 
@@ -225,12 +228,12 @@ def test_another_maker_s_pmu_is_measured_without_any_option(tmp_path: Path) -> N
     port, out = free_port(), tmp_path / "run"
     with start_pyc37_pmu(port, made.config(), made.data, stamp_now=True):
         url = f"tcp://127.0.0.1:{port}?idcode={made.spec.idcode}"
-        result = run_pmu("characterize", url, "--out", out, "--duration", 8, "--no-report")
+        result = run_pmu("characterize", url, "--out", out, "--duration", 7, "--no-report")
     assert result.code == 0, result.err
     (found,) = told(out)["streams"]
     assert found["received"] > 20
     ids = {diagnosis["id"] for diagnosis in found["diagnoses"]}
-    assert ids & {"off-grid", "rate-mismatch"}, result.out
+    assert "rate-mismatch" in ids, result.out
     assert 0 <= found["delay_ms"]["p50"] < 200
 
 

@@ -262,9 +262,9 @@ def test_stalls_and_retransmissions_are_taken_down() -> None:
     engine = Engine(wanted, lambda flow, idcode: (0,), begin_ns=START_NS)
     engine.take([block(range(60), tcp(50_001))])
     engine.stalled(80 * MS, START_NS)
-    engine.retransmitted((0,), 5)
+    engine.resent((0,), 1, 5)
     (result,) = results(engine).values()
-    assert {"host-stalls", "retransmissions"} <= ids(engine, result)
+    assert {"host-stalls", "tcp-losses"} <= ids(engine, result)
 
 
 # --- blocks
@@ -395,3 +395,26 @@ def test_sequences_are_whole(chunks: Sequence[int] = (1, 7, 60)) -> None:
     assert found[0][0] == found[1][0] == found[2][0]
     assert found[0][2] == found[1][2] == found[2][2]
     assert found[0][1] == pytest.approx(found[2][1])
+
+
+def test_what_a_live_source_tells_of_the_host_is_handed_over_once() -> None:
+    from types import SimpleNamespace
+
+    from pmutools.tools.characterizer.hostwatch import HostWatch
+
+    wanted = (Wanted(parse_endpoint("udp://0.0.0.0:4713")), Wanted(parse_endpoint("tcp://192.0.2.1:4712")))
+    engine = Engine(wanted, lambda flow, idcode: (1,), begin_ns=START_NS)
+    engine.take([block(range(60), tcp(50_001))])
+    stalls = [SimpleNamespace(length_ns=60 * MS, utc_ns=START_NS), SimpleNamespace(length_ns=90 * MS, utc_ns=START_NS)]
+    counts = SimpleNamespace(retransmits=1, out_of_order=4)
+    source = SimpleNamespace(host=SimpleNamespace(stalled=2, stalls=stalls), tcp_counts=lambda place: counts)
+    watch = HostWatch(source, engine)
+    for second in range(3):
+        watch.look(second * NS)
+    events = engine.gauges[0].meter.events
+    assert (events.stalls, events.longest_stall_ms) == (2, 90.0)
+    assert (events.retransmits, events.out_of_order) == (1, 4)
+    counts.out_of_order = 2  # another connection
+    watch.look(9 * NS)
+    assert events.out_of_order == 4
+    HostWatch(SimpleNamespace(), engine).look(0)

@@ -205,10 +205,11 @@ class Engine:
             events.stalls += 1
             events.longest_stall_ms = max(events.longest_stall_ms, length_ns / _MS)
 
-    def retransmitted(self, owners: Sequence[int], segments: int) -> None:
-        """TCP sent so many segments again to the endpoints at these places."""
-        for gauge in self._of(owners):
-            gauge.meter.events.retransmits += segments
+    def resent(self, owners: Sequence[int], retransmits: int, out_of_order: int) -> None:
+        """TCP of the endpoints at these places sent so many segments again, and got so many out of order."""
+        for gauge in self._of(owners) if retransmits or out_of_order else ():
+            gauge.meter.events.retransmits += retransmits
+            gauge.meter.events.out_of_order += out_of_order
 
     def sample_clock(self, quality: ClockQuality) -> None:
         """How good the receiver's clock is now."""

@@ -25,6 +25,7 @@ from pmutools.measure.timeline import Course
 from pmutools.timebase import NS
 from pmutools.tools.characterizer.engine import Engine
 from pmutools.tools.characterizer.folder import SUMMARY, Folder
+from pmutools.tools.characterizer.hostwatch import HostWatch
 from pmutools.tools.characterizer.recorder import Recorder
 from pmutools.tools.characterizer.telling import final_summary, results_of, run_part
 from pmutools.tools.characterizer.truth import Truth, hold_to
@@ -120,10 +121,12 @@ class Job:
         self._extra = lambda: _bytes_of(source) | {"unwanted_frames": source.receivers.unwanted}
         recorder = self._record(live=True)
         offset, sample_ns = utc_offset(clock, 3), 0
+        watch = HostWatch(source, engine)
         for items in source.rounds(self._settings.round_ns):
             now_ns = clock.realtime_ns()
             engine.take(items)
             offset = self._look_at_clock(offset, now_ns)
+            watch.look(clock.monotonic_ns())
             if sample_clock is not None and clock.monotonic_ns() >= sample_ns:
                 sample_ns = clock.monotonic_ns() + CLOCK_NS
                 engine.sample_clock(sample_clock())
