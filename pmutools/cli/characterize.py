@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,10 +21,13 @@ from pmutools.timebase import NS
 
 if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
+    from pmutools.c37118.demux import Loss, Message
+    from pmutools.cli.stage import Stage
+    from pmutools.formats.source import Block
     from pmutools.net.dialogue import LinkEvent
     from pmutools.sites import Site
     from pmutools.tools.characterizer.engine import Engine
-    from pmutools.tools.characterizer.job import Job, Outcome, Settings
+    from pmutools.tools.characterizer.job import Job, Observe, Outcome, Settings
 
 PROGRESS_NS = NS // 2
 TOLD_REASONS = 3
@@ -57,6 +60,7 @@ TOLD_REASONS = 3
 @click.option("--require", metavar="LIMITS", help="delay_p99<=90ms,loss<=0.1%: exit code 3 where one does not hold.")
 @click.option("--no-samples", is_flag=True, help="No samples.parquet: for long runs of many streams.")
 @click.option("--no-report", is_flag=True, help="No report.html and figures.")
+@click.option("--live", "shown", is_flag=True, help="Show all streams on the terminal while they are measured.")
 @DURATION
 @common
 def command(as_json: bool, quiet: bool, verbose: int, no_report: bool, **said: Any) -> int:
@@ -100,6 +104,7 @@ class Asked:
     exact_profile: bool
     require: str | None
     no_samples: bool
+    shown: bool
     duration_ns: int | None
 
     @property
@@ -115,6 +120,8 @@ def _check(asked: Asked) -> None:
         raise SettingsError(f"--ini {asked.ini} and {targets[0]}: measure one or the other")
     if asked.ini is None and not targets:
         raise SettingsError("what is to be measured? name URLs, a recording, or --ini FILE")
+    if asked.shown and asked.ini is None and not is_live(targets[0]):
+        raise SettingsError(f"--live shows live streams; {targets[0]} is a recording: leave it out")
     if len({is_live(target) for target in targets}) > 1:
         raise SettingsError(f"{targets[0]} and {targets[-1]}: live streams or recordings, not both at once")
     if asked.no_samples and asked.ledger is not None:
@@ -145,15 +152,15 @@ Why = Callable[[], str]
 
 def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> tuple[Job, Why]:
     """Bind first: what has to be imported after that is slow."""
-    from pmutools.cli.news import News
+    from pmutools.cli.stage import Stage
     from pmutools.sites import load_sites
     from pmutools.tools.characterizer.wanted import wanted_of
     from pmutools.tools.live import LiveSource
 
     sites = load_sites(asked.ini) if asked.ini is not None else ()
     wanted = wanted_of(asked.targets, sites)
-    news = News(talk, verbose)
-    hearing: list[Callable[[LinkEvent], None]] = [news]
+    stage = Stage(talk, verbose, stop)
+    hearing: list[Callable[[LinkEvent], None]] = [stage.hear]
 
     def tell(event: LinkEvent) -> None:
         for hear in hearing:
@@ -162,7 +169,7 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> t
     with ExitStack() as stack:
         endpoints = [each.endpoint for each in wanted]
         source = stack.enter_context(
-            LiveSource(endpoints, duration_ns=asked.duration_ns, configs=_saved(sites), tell=tell, stop=stop)
+            LiveSource(endpoints, duration_ns=asked.duration_ns, configs=_saved(sites), tell=tell, stop=stage.over)
         )
         begin_ns = source.clock.realtime_ns()
         from pmutools.clocksources.watch import ClockWatch
@@ -175,8 +182,11 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> t
         hearing.append(lambda event: engine.hear(event, source.clock.realtime_ns()))
         job = Job(engine, Folder(asked.out), settings, source.clock, source=asked.name)
         watch = stack.enter_context(ClockWatch())
-        job.live(source, lambda: watch.quality, _progress(talk))
-    return job, lambda: "; ".join(dict.fromkeys(map(news.reasons.why, range(min(len(wanted), TOLD_REASONS)))))
+        if asked.shown:
+            how = {"view": "delay", "out": asked.out, "wait_ns": settings.wait_ns, "clock": watch}
+            stack.enter_context(stage.open(source, f"pmu characterize {asked.name}", name=engine.name, **how))
+        job.live(source, lambda: watch.quality, _progress(talk, stage))
+    return job, lambda: "; ".join(dict.fromkeys(map(stage.reasons.why, range(min(len(wanted), TOLD_REASONS)))))
 
 
 def _recorded(asked: Asked, talk: Talk, stop: Callable[[], bool]) -> tuple[Job, Why]:
@@ -204,18 +214,21 @@ def _saved(sites: tuple[Site, ...]) -> tuple[StreamConfig, ...]:
     return saved_configs(sites)
 
 
-def _progress(talk: Talk) -> Callable[[Engine], None]:
+def _progress(talk: Talk, stage: Stage | None = None) -> Observe:
     from pmutools.cli.herald import Herald
     from pmutools.clock import SystemClock
 
-    herald, clock = Herald(talk), SystemClock()
+    clock, progress = SystemClock(), Herald(talk).progress if stage is None else stage.progress
     due_ns = clock.monotonic_ns() + PROGRESS_NS
 
-    def observe(engine: Engine) -> None:
+    def observe(engine: Engine, items: Sequence[Block | Message | Loss]) -> None:
         nonlocal due_ns
-        if clock.monotonic_ns() >= due_ns:
-            due_ns = clock.monotonic_ns() + PROGRESS_NS
-            herald.progress(lambda: f"{sum(g.frames for g in engine.gauges)} frames of {len(engine.gauges)} streams")
+        now_ns = clock.monotonic_ns()
+        if stage is not None:
+            stage.look(items, now_ns)
+        if now_ns >= due_ns:
+            due_ns = now_ns + PROGRESS_NS
+            progress(lambda: f"{sum(g.frames for g in engine.gauges)} frames of {len(engine.gauges)} streams")
 
     return observe
 

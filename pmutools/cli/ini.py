@@ -48,6 +48,7 @@ def command(
     configuration only once a minute, so give it --duration 70. With --json, stdout is what was seen, as data.
     Exit code 1 says that no stream was found, 3 that bytes came that could not be read.
     """
+    from pmutools.cli.herald import Herald
     from pmutools.cli.news import News
     from pmutools.tools.survey import survey
 
@@ -60,7 +61,7 @@ def command(
         talk.progress(f"{seen} of {len(endpoints)} endpoints, {sum(len(e.streams) for e in endpoints)} streams")
 
     with interruptible() as stop:
-        seen = survey(urls, duration_ns=duration_ns, stop=stop, tell=News(talk, verbose), progress=progress)
+        seen = survey(urls, duration_ns=duration_ns, stop=stop, tell=News(Herald(talk).say, verbose), progress=progress)
     talk.progress("")
     _tell(seen, talk)
     if seen.streams:

@@ -24,7 +24,8 @@ from pmutools.tools.watch import Watch
 class LiveShow:
     """From ``with`` to its end: give it the news (:meth:`hear`) and the rounds (:meth:`each_round`) of ``source``.
 
-    ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own.
+    ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own,
+    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` knows streams (None: by their sites).
     """
 
     def __init__(
@@ -38,17 +39,21 @@ class LiveShow:
         more: Callable[[], Sequence[str]] = tuple,
         commands: Sequence[Command] = (),
         wait_ns: int = WAIT_NS,
+        clock: ClockWatch | None = None,
+        name: Callable[[Flow, int], str | None] | None = None,
     ) -> None:
         self._source, self._more = source, more
         self._out = None if out is None or str(out) == "-" else Path(out)
-        self.watch = Watch(name=self._name, wait_ns=wait_ns)
+        self.watch = Watch(name=name or self._site, wait_ns=wait_ns)
         self.screen = WatchScreen(title=title, view=view, commands=commands, herald=Herald(talk))
         self._facts: tuple[str, ...] = ()
         self._facts_due_ns = 0
+        self._clock = clock
         self._stack = ExitStack()
 
     def __enter__(self) -> LiveShow:
-        self.clock = self._stack.enter_context(ClockWatch())
+        if self._clock is None:
+            self._clock = self._stack.enter_context(ClockWatch())
         self._stack.enter_context(self.screen)
         return self
 
@@ -67,12 +72,13 @@ class LiveShow:
         self.screen.update(self.watch, now_ns, self._facts)
 
     def _look(self) -> Iterator[str]:
-        yield self.clock.quality.short
+        if self._clock is not None:
+            yield self._clock.quality.short
         if self._out is not None:
             yield f"{self._out.name} {_size(self._out) / 1e6:.1f} MB"
         yield from self._more()
 
-    def _name(self, flow: Flow, idcode: int) -> str | None:
+    def _site(self, flow: Flow, idcode: int) -> str | None:
         site = self._source.site(flow, idcode)
         return None if site is None else site.name
 

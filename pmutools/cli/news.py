@@ -1,9 +1,9 @@
-"""The news of live endpoints for a person: told on stderr as they come."""
+"""The news of live endpoints for a person, as they come."""
 
 from __future__ import annotations
 
-from pmutools.cli.herald import Herald
-from pmutools.cli.shell import Talk
+from collections.abc import Callable
+
 from pmutools.net.dialogue import LinkEvent
 from pmutools.tools.news import USUAL, Reasons, told
 
@@ -12,20 +12,20 @@ PLACES = 10_000
 
 
 class News:
-    """Says what is out of the ordinary, and once what is said again; with ``verbose`` everything.
+    """Has ``say`` say what is out of the ordinary, and once what is said again; with ``verbose`` everything.
 
     ``reasons`` are what it has heard.
     """
 
-    def __init__(self, talk: Talk, verbose: int) -> None:
+    def __init__(self, say: Callable[[str], None], verbose: int) -> None:
         self.reasons = Reasons()
-        self._herald, self._verbose = Herald(talk), verbose
+        self._say, self._verbose = say, verbose
         self._said: dict[str, str] = {}
 
     def __call__(self, event: LinkEvent) -> None:
         self.reasons.hear(event)
         text = told(event)
         if self._verbose or (event.kind not in USUAL and self._said.get(event.where) != text):
-            self._herald.say(f"{event.where}: {text}")
+            self._say(f"{event.where}: {text}")
         if event.where in self._said or len(self._said) < PLACES:
             self._said[event.where] = text

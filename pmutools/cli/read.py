@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -17,7 +17,8 @@ from pmutools.errors import SettingsError
 from pmutools.timebase import NS
 
 if TYPE_CHECKING:
-    from pmutools.net.dialogue import LinkEvent
+    from pmutools.cli.stage import Stage
+    from pmutools.cli.watch_keys import Command
     from pmutools.tools.live import LiveSource
     from pmutools.tools.reader import Reading
     from pmutools.tools.reader.log import Recorder
@@ -99,6 +100,7 @@ if TYPE_CHECKING:
     metavar="N",
     help="With --split or --trigger: delete the oldest files of this run, so that N are left.",
 )
+@click.option("--live", is_flag=True, help="Show all streams on the terminal while they are read.")
 @DURATION
 @common
 def command(
@@ -116,6 +118,7 @@ def command(
     ring_ns: int | None,
     after_ns: int | None,
     keep: int | None,
+    live: bool,
     duration_ns: int | None,
     as_json: bool,
     quiet: bool,
@@ -126,6 +129,7 @@ def command(
     Several streams are written side by side into a folder named as the file, without suffix.
     Exit code 3 says that bytes came that are no frames, or that this machine could not keep up.
     """
+    from pmutools.cli.stage import Stage
     from pmutools.tools.live import LiveSource
 
     if not (out or listing):
@@ -134,8 +138,9 @@ def command(
         raise SettingsError("--ring and --after are for --trigger; add one, as in --trigger freq<59.95")
     talk = Talk(quiet, verbose)
     with interruptible() as stop, ExitStack() as stack:
+        stage = Stage(talk, verbose, stop)
         source = stack.enter_context(
-            LiveSource(_endpoints(urls, ini), duration_ns=duration_ns, tell=_teller(talk, verbose), stop=stop)
+            LiveSource(_endpoints(urls, ini), duration_ns=duration_ns, tell=stage.hear, stop=stage.over)
         )
         from pmutools.tools.reader.recorder import Recording  # slow to import: the sockets are bound by now
         from pmutools.tools.reader.ring import Window
@@ -147,7 +152,8 @@ def command(
         recording = Recording(
             cast("str", out), form, polar, long_form, fields, per_stream, split, keep, triggers or (), window
         )
-        reading, recorder = _read(source, recording, talk, stack)
+        what = f"pmu read {out} ← {ini or ', '.join(urls)}" if live else ""
+        reading, recorder = _read(source, recording, talk, stage, what, stack)
         stopped = stop()
     return report(source, recording, reading, recorder, talk, as_json=as_json, stopped=stopped)
 
@@ -162,23 +168,10 @@ def _endpoints(urls: Sequence[str], ini: str | None) -> list[Any]:
     return [*urls, *load_sites(ini)]
 
 
-def _teller(talk: Talk, verbose: int) -> Callable[[LinkEvent], None]:
-    from pmutools.cli.herald import Herald
-    from pmutools.net.dialogue import LinkKind
-
-    herald = Herald(talk)
-    news = frozenset(LinkKind) - {LinkKind.BOUND, LinkKind.CONNECTED, LinkKind.CONFIGURED, LinkKind.STREAMING}
-
-    def tell(event: LinkEvent) -> None:
-        if verbose or event.kind in news:
-            detail = event.detail.removeprefix(f"{event.where}: ")
-            herald.say(f"{event.where}: {event.kind}" + (f": {detail}" if detail else ""))
-
-    return tell
-
-
-def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack) -> tuple[Reading, Recorder]:
-    from pmutools.cli.herald import Herald
+def _read(
+    source: LiveSource, recording: Recording, talk: Talk, stage: Stage, shown: str, stack: ExitStack
+) -> tuple[Reading, Recorder]:
+    """``shown`` is the title of the display, empty for none."""
     from pmutools.tools.live import ROUND_NS
     from pmutools.tools.reader import read
     from pmutools.tools.reader.known import FieldCheck, Known
@@ -186,37 +179,39 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
     from pmutools.tools.reader.ring import Ring
     from pmutools.tools.reader.run import FLUSH_NS
 
-    herald = Herald(talk)
-    recorder = stack.enter_context(open_recorder(recording, source, herald.say))
+    recorder = stack.enter_context(open_recorder(recording, source, stage.say))
     observers: list[Observer] = []
     check = None
     if recording.fields is not None:
-        check = FieldCheck(recording.fields, recording.phasors, Known(source), herald.say)
+        check = FieldCheck(recording.fields, recording.phasors, Known(source), stage.say)
         observers.append(check)
     if isinstance(recorder, Ring):
-        observers += triggered_by_hand(recorder, [each.text for each in recording.triggers], talk, stack)
+        kinds = [each.text for each in recording.triggers]
+        observers += triggered_by_hand(recorder, [kind for kind in kinds if not (shown and kind == "key")], talk, stack)
     many = False
     soon = recording.to_stdout or isinstance(recorder, Ring)
 
+    if shown:
+        stack.enter_context(stage.open(source, shown, out=recording.out, commands=_commands(recorder)))
+
     def observe(found: Any) -> None:
+        stage.look(found, source.clock.monotonic_ns())
         for each in observers:
             each(found)
 
     def progress(now: Reading) -> None:
         nonlocal many
-        herald.progress(lambda: f"{now.frames} frames, {len(now.streams)} streams")
+        stage.progress(lambda: f"{now.frames} frames, {len(now.streams)} streams")
         if not (many or recording.per_stream) and len(recorder.paths) > MANY_TABLES:
             many = True
-            herald.say(
-                f"more than {MANY_TABLES} tables side by side: --long writes all streams into one, for less work"
-            )
+            stage.say(f"more than {MANY_TABLES} tables side by side: --long writes all streams into one, for less work")
 
     reading = read(
         source,
         recorder,
         progress,
         observe=observe,
-        round_ns=ROUND_NS if soon else FLUSH_NS,
+        round_ns=ROUND_NS if soon or shown else FLUSH_NS,
         flush_ns=0 if recording.to_stdout else FLUSH_NS,
         threaded=True,
     )
@@ -226,3 +221,19 @@ def _read(source: LiveSource, recording: Recording, talk: Talk, stack: ExitStack
         for text in recorder.idle if isinstance(recorder, Ring) else ():
             talk.say(f"--trigger: {text} has fitted no station or channel of the streams that came")
     return reading, recorder
+
+
+def _commands(recorder: Recorder) -> tuple[Command, ...]:
+    """Keys of the display that are the recording's own."""
+    from pmutools.cli.watch_keys import Command
+    from pmutools.tools.reader.ring import Ring
+
+    if not isinstance(recorder, Ring):
+        return ()
+
+    def fire() -> str:
+        if not recorder.fire("key"):
+            raise SettingsError("'key' is not among the triggers: add it, as in --trigger key,freq<59.95")
+        return "recording"
+
+    return (Command("t", "t trigger", "record now", fire),)

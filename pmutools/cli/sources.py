@@ -67,10 +67,11 @@ def open_target(target: str, duration_ns: int | None, talk: Talk, verbose: int =
     The news of an endpoint are told as they come.
     """
     if is_live(target):
+        from pmutools.cli.herald import Herald
         from pmutools.cli.news import News
         from pmutools.tools.live import LiveSource
 
-        news = News(talk, verbose)
+        news = News(Herald(talk).say, verbose)
         with interruptible() as stop, LiveSource([target], duration_ns=duration_ns, tell=news, stop=stop) as live:
             yield Opened(live, news.reasons.why, stop)
         return

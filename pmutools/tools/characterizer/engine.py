@@ -86,6 +86,11 @@ class Engine:
         """IDCODEs that were configured, by where; None where there was trouble, so that all is news."""
         self._drained = 0
 
+    def name(self, flow: Flow, idcode: int) -> str | None:
+        """What a stream is called; None for one that is not measured yet."""
+        gauge = self._by_flow.get(flow, {}).get(idcode)
+        return None if gauge is None else gauge.name
+
     # --- what comes
 
     def take(self, items: Iterable[Block | Message | Loss]) -> None:

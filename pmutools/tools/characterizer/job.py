@@ -40,10 +40,11 @@ FIT_NS = 3 * NS
 LEDGER_NS = 5 * NS
 """How long a ledger is waited for whose player is about to end."""
 _GROUP = 4096
-Observe = Callable[[Engine], None]
+Observe = Callable[[Engine, Sequence[Block | Message | Loss]], None]
+"""Given the engine and what it has just taken."""
 
 
-def unobserved(engine: Engine) -> None:
+def unobserved(engine: Engine, items: Sequence[Block | Message | Loss]) -> None:
     """Nobody looks on."""
 
 
@@ -131,7 +132,7 @@ class Job:
                 sample_ns = clock.monotonic_ns() + CLOCK_NS
                 engine.sample_clock(sample_clock())
             recorder.look(now_ns)
-            observe(engine)
+            observe(engine, items)
         if sample_clock is not None:
             engine.sample_clock(sample_clock())
         self._close(clock.realtime_ns())
@@ -143,7 +144,7 @@ class Job:
         for items in groups(source.blocks()):
             self.engine.take(items)
             recorder.look(max(self.engine.last_ns, 0))
-            observe(self.engine)
+            observe(self.engine, items)
             if stop():
                 break
         self._close(self.engine.last_ns if self.engine.last_ns != NO_TIME else 0)
