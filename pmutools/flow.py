@@ -13,7 +13,7 @@ class StampSource(StrEnum):
     HARDWARE = "hardware"
     KERNEL = "kernel"
     KERNEL_BATCHED = "kernel-batched"
-    """One kernel stamp for several frames of a TCP read: an upper bound for all but the last."""
+    """One stamp for several frames of a TCP read: an upper bound for all but the last."""
     USER = "user"
     CAPTURE = "capture"
 

@@ -68,6 +68,8 @@ _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 _AA = 0xAA
 _SYNC = re.compile(rb"\xaa(?:[\x00-\x5f\x83\x93\xa3\xb3\xc3\xd3\xe3\xf3]|\Z)", re.DOTALL)
 _COMMAND_SIZE = 18
+_OF_A_READ = (StampSource.KERNEL, StampSource.HARDWARE)
+"""Stamps that are those of a read's last bytes."""
 _KNOWN_HEADS = 64
 """How many distinct (SYNC, FRAMESIZE, IDCODE) a flow remembers as proven."""
 
@@ -150,7 +152,7 @@ class Framer:
             if reason is None:
                 self._close_run(out)
                 frame = buffer[at : at + size] if size < end else buffer
-                batched = self.streaming and at + size < end and stamp_source is StampSource.KERNEL
+                batched = self.streaming and at + size < end and stamp_source in _OF_A_READ
                 source = StampSource.KERNEL_BATCHED if batched else stamp_source  # the stamp is the read's last byte's
                 out.append(Frame(frame, arrival_ns, source, self._offset + at))
             elif reason is SkipReason.UNSUPPORTED:  # whole frames: each a record of its own

@@ -70,7 +70,7 @@ class Intake:
         return number
 
     def drop(self, number: int) -> None:
-        """It has ended; what is there of it can still be looked at."""
+        """It has ended, if it ever began; what is there of it can still be looked at."""
         self._gone.append(number)
 
     def sweep(self, sock: UdpSocket, swept: Swept) -> None:
@@ -123,7 +123,7 @@ class Intake:
         self.columns.clear()
         self._answer_ns = None
         for number in self._gone:
-            del self.sources[number]
+            self.sources.pop(number, None)
         self._gone.clear()
 
     def close(self) -> None:

@@ -81,7 +81,8 @@ class CommandLink:
         self._failures = 0
         self._timer: Timer | None = None
         self._opened_ns = 0
-        self._number = 0
+        self._number = -1
+        """The connection's in the intake."""
         self.noise = ""
         """What came first on this connection and is no C37.118; empty once something is."""
         self._ended = TcpCounts()
@@ -249,6 +250,7 @@ class CommandLink:
             if (intake := self.plumbing.intake) is not None:
                 intake.forget(self._transport)
                 intake.drop(self._number)
+                self._number = -1
             self._transport.close()
         self._transport = self.flow = None
 

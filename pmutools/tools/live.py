@@ -25,7 +25,7 @@ from pmutools.tools.recordings import saved_configs
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
 ROUND_NS = 250_000_000
-"""How long data frames are gathered before they are handed on."""
+"""How long data frames are gathered before they are handed on, and at most before they are looked at."""
 ROUND_FRAMES = 1 << 16
 """So many data frames are handed on before their round is over."""
 
@@ -108,18 +108,21 @@ class LiveSource:
         """
         gatherer = Gatherer()
         out: list[Block | Message | Loss] = []
-        due_ns = self.clock.monotonic_ns() + round_ns
+        now_ns = self.clock.monotonic_ns()
+        due_ns, collect_ns = now_ns + round_ns, now_ns + ROUND_NS
         with self._heartbeat():
             while (left_ns := self._left_ns()) > 0 and not self._stop():
-                wait_ns = max(due_ns - self.clock.monotonic_ns(), 0)
+                wait_ns = max(min(due_ns, collect_ns) - now_ns, 0)
                 early = self.receivers.soak(min(POLL_NS, left_ns, wait_ns))
-                due = self.clock.monotonic_ns() >= due_ns
-                if early or due:
+                now_ns = self.clock.monotonic_ns()
+                if early or now_ns >= min(due_ns, collect_ns):
                     self._gather(self.receivers.collect(), gatherer, out)
-                if due or gatherer.waiting >= ROUND_FRAMES:
-                    due_ns = self.clock.monotonic_ns() + round_ns
+                    collect_ns = now_ns + ROUND_NS
+                if now_ns >= due_ns or gatherer.waiting >= ROUND_FRAMES:
+                    due_ns = now_ns + round_ns
                     yield [*out, *gatherer.flush()]
                     out = []
+                    now_ns = self.clock.monotonic_ns()
         self.receivers.soak(0)
         self._gather(self.receivers.collect(), gatherer, out)
         self._gather(self.receivers.finish(), gatherer, out)

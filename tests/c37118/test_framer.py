@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from pmutools.c37118 import Frame, Framer, Skipped, SkipReason, encode_command, encode_header
 from pmutools.c37118 import framer as framer_module
 from pmutools.c37118.checksum import chk
+from pmutools.flow import StampSource
 
 FRAMES = [encode_command(7, 2), encode_header(7, "a device"), encode_command(7, 8, extended=b"\xaa\x01\xff\xff" * 9)]
 
@@ -153,3 +154,15 @@ def test_a_frame_behind_half_syncs_is_found(noise: bytes) -> None:
     framer.feed(FRAMES[0])
     items = framer.feed(noise + FRAMES[0]) + framer.close()
     assert frames_of(items)[-1:] == FRAMES[:1]
+
+
+@pytest.mark.parametrize("source", StampSource)
+def test_frames_that_share_a_read_share_a_stamp_that_is_too_late_for_all_but_the_last(source: StampSource) -> None:
+    """In a capture each packet has its own, and what user space stamps is late anyway."""
+    framer = Framer(streaming=True)
+    items = framer.feed(b"".join(FRAMES) + FRAMES[0][:5], 1, source) + framer.feed(FRAMES[0][5:], 2, source)
+    batched = StampSource.KERNEL_BATCHED if source in (StampSource.KERNEL, StampSource.HARDWARE) else source
+    expected = [(1, batched)] * 3 + [(2, source)]
+    assert [(item.arrival_ns, item.stamp_source) for item in items if isinstance(item, Frame)] == expected
+    whole = Framer(streaming=False).feed(b"".join(FRAMES), 1, source)
+    assert {item.stamp_source for item in whole if isinstance(item, Frame)} == {source}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import random
 import socket
 import struct
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,7 +16,7 @@ import pytest
 from support.live import CLOCK, Ear, data_frame, free_udp_port, stream, values
 
 from pmutools import linux
-from pmutools.c37118 import Command, FrameType, StreamConfig, decode_command, encode_config
+from pmutools.c37118 import Command, FrameType, StreamConfig, as_kind, decode_command, encode_config
 from pmutools.c37118.session import Timing
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import StampSource
@@ -22,18 +24,25 @@ from pmutools.net import link, receiver, routes
 from pmutools.net.dialogue import LinkKind
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.receiver import Receivers
+from pmutools.net.tcp import TcpCounts
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
-QUICK = Timing(answer_ns=120 * MS, silence_ns=150 * MS, silence_frames=1, tries=3)
+QUICK = Timing(answer_ns=120 * MS, cfg3_ns=40 * MS, silence_ns=150 * MS, silence_frames=1, tries=3)
 EAGER = Timing(answer_ns=300 * MS)
 paths = pytest.mark.parametrize("native", [linux.NATIVE, False], ids=["native", "portable"])
+
+
+@pytest.fixture(params=["polled", "soaked"], autouse=True)
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything holds whichever way what comes is received."""
+    monkeypatch.setattr(Ear, "soaked", request.param == "soaked")
 
 
 @contextmanager
 def ears(*urls: str, native: bool = linux.NATIVE, **options: object) -> Iterator[Ear]:
     with Receivers([parse_endpoint(url) for url in urls], CLOCK, native=native, **options) as receivers:  # type: ignore[arg-type]
-        yield Ear(receivers)
+        yield Ear(receivers, Ear.soaked)
 
 
 @pytest.fixture
@@ -194,6 +203,37 @@ def test_silence_from_the_start_is_told(monkeypatch: pytest.MonkeyPatch, sender:
         assert "idcode=7" in told.where
 
 
+def test_a_configuration_that_comes_unasked_with_another_cfgcnt_holds_from_there(sender: socket.socket) -> None:
+    """The rate may be another, or only the names: the frames look the same."""
+    old = stream(7, cfgcnt=1)
+    new = replace(stream(7, cfgcnt=2), data_rate=30)
+    with ears("udp://127.0.0.1:0") as ear:
+        address = ear.receivers.local(0)
+        assert address is not None
+        for config in (old, new):
+            for frame in (encode_config(config), *(data_frame(config, k * 10**9, value=k) for k in range(3))):
+                sender.sendto(frame, address.sockaddr)
+        ear.until(lambda: len(ear.messages) == 8)
+        assert [message.config for message in ear.messages] == [old] * 4 + [new] * 4
+        details = [event.detail for event in ear.of(LinkKind.CONFIGURED)]
+        assert details == ["CFG2, 60 frames/s, 1 stations", "CFG2, 30 frames/s, 1 stations"]
+
+
+@paths
+def test_hardware_stamps_are_asked_for_and_the_kernel_s_taken_where_there_are_none(
+    sender: socket.socket, device: Device, native: bool
+) -> None:
+    urls = ("udp://127.0.0.1:0?stamps=hardware", f"tcp://127.0.0.1:{device.port}?idcode=7&stamps=hardware")
+    with ears(*urls, native=native) as ear:
+        address = ear.receivers.local(0)
+        assert address is not None
+        sender.sendto(encode_config(stream(8)), address.sockaddr)
+        ear.until(lambda: len(ear.messages) == 1)
+        play(device, ear, stream(7))
+        sources = {message.frame.stamp_source for message in ear.messages} - {StampSource.KERNEL_BATCHED}
+        assert sources == {StampSource.KERNEL if native else StampSource.USER}
+
+
 def test_a_stream_that_stops_is_told_and_told_when_it_is_back(sender: socket.socket) -> None:
     config = stream(7)
     with ears("udp://127.0.0.1:0", timing=QUICK) as ear:
@@ -284,6 +324,39 @@ def test_cfg3_falls_back_to_cfg2(device: Device) -> None:
         ear.until(hears(device, Command.SEND_CFG3, Command.SEND_CFG2))
         device.say(encode_config(stream(7)))
         ear.until(hears(device, Command.SEND_CFG3, Command.SEND_CFG2, Command.START_DATA))
+
+
+def test_a_silent_cfg3_is_not_waited_for_long(device: Device) -> None:
+    """As long as a person hardly notices, although an answer may take three seconds."""
+    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", want_cfg3=True) as ear:
+        ear.until(hears(device, Command.SEND_CFG3))
+        began_ns = CLOCK.monotonic_ns()
+        ear.until(hears(device, Command.SEND_CFG3, Command.SEND_CFG2))
+        assert 500 * MS < CLOCK.monotonic_ns() - began_ns < 2500 * MS
+
+
+def test_a_cfg2_that_comes_unasked_changes_nothing_unless_it_says_something_new(device: Device) -> None:
+    """Devices send theirs once a minute; what a CFG-3 says more must not come and go with it."""
+    full = as_kind(stream(7, phasors=2, cfgcnt=4), FrameType.CFG3)
+    full = replace(full, stations=(replace(full.stations[0], name="A name of more than sixteen characters"),))
+    short = as_kind(full, FrameType.CFG2)
+    with ears(f"tcp://127.0.0.1:{device.port}?idcode=7", want_cfg3=True, timing=EAGER) as ear:
+        ear.until(hears(device, Command.SEND_CFG3))
+        device.say(encode_config(full))
+        ear.until(hears(device, Command.SEND_CFG3, Command.START_DATA))
+        device.say(data_frame(full, 10**9, value=1) + encode_config(short) + data_frame(full, 2 * 10**9, value=2))
+        ear.until(lambda: values(ear.messages) == [1, 2])
+        assert [message.config for message in ear.messages] == [full] * 4
+        assert ear.kinds.count(LinkKind.CONFIGURED) == 1
+        device.heard = b""
+        CLOCK.sleep_until(CLOCK.monotonic_ns() + EAGER.answer_ns)
+        changed = replace(short, stations=(replace(short.stations[0], cfgcnt=5),))
+        device.say(encode_config(changed) + data_frame(full, 3 * 10**9, value=3))
+        ear.until(hears(device, Command.SEND_CFG3))
+        assert ear.messages[-1].config == changed, "until the answer comes it is the best there is"
+        device.say(encode_config(replace(full, stations=(replace(full.stations[0], cfgcnt=5),))))
+        ear.until(hears(device, Command.SEND_CFG3, Command.START_DATA))
+        assert ear.messages[-1].config.kind is FrameType.CFG3  # type: ignore[union-attr]
 
 
 def test_a_silent_server_is_diagnosed_and_tried_again(device: Device) -> None:
@@ -451,6 +524,52 @@ def test_many_connections_in_one_loop() -> None:
 
 
 # --- mistakes
+
+
+RUN_OUT = """
+import resource, time
+from pmutools.clock import SystemClock
+from pmutools.errors import SourceError
+from pmutools.net.endpoint import parse_endpoint
+from pmutools.net.receiver import Receivers
+resource.setrlimit(resource.RLIMIT_NOFILE, (100, {hard}))
+began = time.process_time()
+try:
+    with Receivers([parse_endpoint("udp://127.0.0.1:0?idcode=%d" % (k + 1)) for k in range({count})], SystemClock()):
+        print("opened", time.process_time() - began < 1)
+except SourceError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
+def test_thousands_of_sockets_are_opened_as_far_as_the_system_lets_us(way: None) -> None:
+    import resource
+
+    def opened(hard: int) -> str:
+        command = [sys.executable, "-c", RUN_OUT.format(hard=hard, count=2000)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout.strip()
+
+    if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 5000:
+        pytest.skip("this system lets nobody open so many")
+    assert opened(5000) == "opened True"
+    told = opened(500)
+    assert "this process may have 500 files open; raise the limit (ulimit -Hn, LimitNOFILE=)" in told
+    assert "\n" not in told
+
+
+def test_what_tcp_has_counted_is_told_by_endpoint(device: Device) -> None:
+    """On loopback nothing is lost; the counts of a connection outlive it."""
+    url = f"tcp://127.0.0.1:{device.port}?idcode=7"
+    with ears(url, url, "udp://127.0.0.1:0") as ear:
+        play(device, ear, stream(7))
+        assert ear.receivers.tcp_counts(0) == ear.receivers.tcp_counts(1) == TcpCounts(0, 0)
+        link = ear.receivers._links[0]
+        link._ended = TcpCounts(3, 4)
+        device.hang_up()
+        ear.until(lambda: LinkKind.LOST in ear.kinds)
+        assert ear.receivers.tcp_counts(0) == TcpCounts(3, 4)
+        assert ear.receivers.tcp_counts(2) == TcpCounts()
 
 
 def test_what_cannot_be_opened_is_told_before_anything_runs() -> None:

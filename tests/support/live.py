@@ -19,9 +19,11 @@ from pmutools.c37118 import (
     StreamConfig,
     encode_data,
 )
+from pmutools.c37118.demux import DataRun
+from pmutools.c37118.framer import Frame
 from pmutools.c37118.frames import wire_values
 from pmutools.clock import SystemClock
-from pmutools.flow import Chunk
+from pmutools.flow import Chunk, Flow
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.outlet import ServerEvent
 from pmutools.net.receiver import Receivers
@@ -84,20 +86,46 @@ def free_ports(count: int) -> list[int]:
 
 @dataclass
 class Ear:
-    """Everything that receivers have given, in order."""
+    """Everything that receivers have given, in order, polled or, where ``soaked``, received in bulk."""
 
     receivers: Receivers
+    soaked: bool = False
     chunks: list[Chunk] = field(default_factory=list)
     news: list[LinkEvent] = field(default_factory=list)
     messages: list[Message] = field(default_factory=list)
 
     def listen(self, timeout_ns: int = 1_000_000) -> None:
+        if self.soaked:
+            self._soak(timeout_ns)
+            return
         for item in self.receivers.poll(timeout_ns):
             if isinstance(item, Chunk):
                 self.chunks.append(item)
             else:
                 self.news.append(item)
             self.messages += [found for found in self.receivers.parse(item) if isinstance(found, Message)]
+
+    def _soak(self, timeout_ns: int) -> None:
+        self.receivers.soak(timeout_ns)
+        intake = self.receivers._plumbing.intake
+        if intake is not None:
+            rows = intake.columns.look()
+            self.chunks += [
+                Chunk(intake.columns.datagram(row), int(rows.arrivals_ns[row]), Flow("", ""))
+                for row in range(len(rows.sizes))
+            ]
+        else:
+            self.chunks += [item for item in self.receivers._out if isinstance(item, Chunk)]
+        for item in self.receivers.collect():
+            if isinstance(item, LinkEvent):
+                self.news.append(item)
+            elif isinstance(item, DataRun):
+                train, config = item
+                for chunk in train.chunks():
+                    frame = Frame(chunk.data, chunk.arrival_ns, chunk.stamp_source, 0)
+                    self.messages.append(Message(frame, chunk.flow, config))
+            elif isinstance(item, Message):
+                self.messages.append(item)
 
     @property
     def kinds(self) -> list[LinkKind]:
