@@ -25,7 +25,7 @@ class LiveShow:
     """From ``with`` to its end: give it the news (:meth:`hear`) and the rounds (:meth:`each_round`) of ``source``.
 
     ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own,
-    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` knows streams (None: by their sites).
+    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` those streams (None: by sites).
     """
 
     def __init__(

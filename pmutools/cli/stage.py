@@ -1,4 +1,4 @@
-"""Where the news of a command that takes live streams go: to stderr, or to its ``--live`` display while there is one."""
+"""Where the news of a command with live streams go: to stderr, or to its ``--live`` display while there is one."""
 
 from __future__ import annotations
 
