@@ -14,7 +14,7 @@ REMEDIES = {
     "latency-step": "look what was changed at that time: routes, filters (P or M class), clocks",
     "delay-of-a-period": "ask the vendor for the reporting latency; a higher rate, or P class filters, shorten it",
     "reconnects": "look into the log for when, and at the sender for why",
-    "retransmissions": "look for the lossy link on the path; over UDP a loss delays no other frame",
+    "tcp-losses": "look for the lossy link on the path; over UDP a loss delays no other frame",
     "pauses": "look into the sender's and the network's logs at that time",
     "periodic-delay": "look for what runs at this period: polling, schedulers, resampling concentrators",
     "stale-frames": "none is needed if they come at the start only; else look for what stores frames on the way",
