@@ -183,6 +183,8 @@ class ClientRole:
         """Whether a change of the configuration is announced: STAT bit 10 of any station."""
         self._timeouts = 0
         self._asked_ns: int | None = None
+        self._unfit: StreamConfig | None = None
+        """The CFG-3 that did not fit last."""
 
     def handle(self, event: ClientEvent, now_ns: int) -> tuple[ClientAction, ...]:
         """Take one step of the table."""
@@ -229,9 +231,18 @@ class ClientRole:
         return self.handle(ClientEvent.DATA, now_ns) if self.state is not ClientState.STREAMING else ()
 
     def hear_misfit(self, now_ns: int) -> tuple[ClientAction, ...]:
-        """A data frame came that no known configuration fits."""
+        """A data frame came that no known configuration fits.
+
+        A server whose CFG-3 does not fit, and is the same when asked for again, is asked for CFG-2 from then on.
+        """
         self.heard_ns = now_ns
-        return self.handle(ClientEvent.CHANGED, now_ns) if self._may_ask(now_ns) else ()
+        if not self._may_ask(now_ns):
+            return ()
+        if self.config is not None and self.config.kind is FrameType.CFG3:
+            if self.table is CFG3_FIRST and self._unfit == self.config:
+                self.table = CFG2_FIRST
+            self._unfit = self.config
+        return self.handle(ClientEvent.CHANGED, now_ns)
 
     def check_time(self, now_ns: int) -> tuple[ClientAction, ...]:
         """To be called at :attr:`deadline_ns` or later; does nothing before."""

@@ -16,6 +16,7 @@ from pmutools.c37118 import (
     PhasorChannel,
     Station,
     StreamConfig,
+    as_kind,
     decode_command,
     decode_config,
     decode_header,
@@ -124,6 +125,35 @@ def test_cfg3_is_asked_for_first_and_given_up_on_silence() -> None:
     assert role.hear_config(CONFIG, NS + 1) == (A.SEND_START,)
     role.handle(E.CLOSED, 4 * NS)
     assert role.handle(E.OPENED, 5 * NS) == (A.REQUEST_CFG2,)  # it does not know CFG-3: not asked for again
+
+
+def test_cfg3_that_does_not_fit_the_data_is_given_up_when_it_comes_again() -> None:
+    full = as_kind(CONFIG, FrameType.CFG3)
+    role = ClientRole(CFG3_FIRST)
+    role.handle(E.OPENED, 0)
+    assert role.hear_config(full, 1) == (A.SEND_START,)
+    assert role.hear_misfit(4 * NS) == (A.REQUEST_CFG3,), "it may have changed"
+    assert role.hear_config(full, 4 * NS + 1) == (A.SEND_START,)
+    assert role.hear_misfit(5 * NS) == (), "not so soon"
+    assert role.hear_misfit(8 * NS) == (A.REQUEST_CFG2,)
+    assert role.hear_config(CONFIG, 8 * NS + 1) == (A.SEND_START,)
+    assert role.hear_data(data(CONFIG, 0), CONFIG, 8 * NS + 2) == ()
+    assert role.state is S.STREAMING
+
+
+def test_a_cfg2_that_says_less_makes_it_ask_again() -> None:
+    """The server has changed its configuration, and told so in the short form."""
+    full = as_kind(CONFIG, FrameType.CFG3)
+    role = ClientRole(CFG3_FIRST)
+    role.handle(E.OPENED, 0)
+    role.hear_config(full, 1)
+    role.hear_data(data(full, 0), full, 2)
+    assert role.hear_config(TWO, 5 * NS) == (A.REQUEST_CFG3,)
+    assert role.hear_config(as_kind(TWO, FrameType.CFG3), 5 * NS + 1) == (A.SEND_START,)
+    spontaneous = ClientRole(SPONTANEOUS)
+    spontaneous.handle(E.OPENED, 0)
+    spontaneous.hear_config(full, 1)
+    assert spontaneous.hear_config(TWO, 5 * NS) == ()
 
 
 def test_cfg3_that_is_answered_stays() -> None:

@@ -312,6 +312,6 @@ def test_info_and_dump_of_a_live_stream(source: Path) -> None:
         assert told.json["streams"][0]["frames"] > 20
         lines = run_pmu("dump", url, "--duration", 1, "--json")
         assert lines.code == 0, lines.err
-            assert {"cfg3", "data"} <= {line["type"] for line in lines.lines}
+        assert {"cfg3", "data"} <= {line["type"] for line in lines.lines}
         player.send_signal(signal.SIGINT)
         ended(player)
