@@ -227,6 +227,45 @@ class Demux:
         self.tally.count(_DATA, len(arrivals_ns), size)
         return True
 
+    def waits(self, flow: Flow, head: bytes) -> bool:
+        """Whether whole frames of ``flow`` that begin with ``head`` would be put on hold, as others of theirs are.
+
+        False: only :meth:`feed` can tell.
+        """
+        state = self._flows.get(flow)
+        if state is None or (flow.is_stream and state.framer.pending):
+            return False
+        size, idcode = head[2] << 8 | head[3], head[4] << 8 | head[5]
+        if idcode not in state.held:
+            return False
+        known = [*self._configs.get((state.host, idcode), {}).values(), *filter(None, (self._saved.get(idcode),))]
+        return all(config.frame_size != size for config in known)
+
+    def hold(self, train: Train) -> bool:
+        """Put whole, good frames on hold, all with a head that :meth:`waits` knows; false where that is not so simple.
+
+        Then they are to be fed one by one.
+        """
+        data, size, arrivals_ns, flow, source = train
+        if not self.waits(flow, data[:6]):
+            return False
+        state = self._flows[flow]
+        held = state.held[data[4] << 8 | data[5]]
+        if held.nbytes + len(data) > HELD_BYTES or self._held_bytes + len(data) > ALL_HELD_BYTES:
+            return False
+        offset = state.framer.offset
+        places = range(0, len(data), size)
+        held.frames += [
+            _new(Frame, (data[at : at + size], arrival_ns, source, offset + at))
+            for at, arrival_ns in zip(places, arrivals_ns, strict=True)
+        ]
+        held.nbytes += len(data)
+        self._held_bytes += len(data)
+        self.tally.fed += len(data)
+        state.fresh = True
+        state.framer.pass_over(len(data))
+        return True
+
     def end(self, flow: Flow) -> list[Message | Loss]:
         """A connection or file is over: frame or skip what is pending in it, and forget it."""
         out: list[Message | Loss] = []

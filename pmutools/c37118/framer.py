@@ -131,6 +131,11 @@ class Framer:
         self._scan(out, arrival_ns, stamp_source, final=not self.streaming)
         return out
 
+    @property
+    def offset(self) -> int:
+        """Bytes of the flow that are in frames or skipped."""
+        return self._offset
+
     def pass_over(self, nbytes: int) -> None:
         """Bytes of the flow that were found to be whole frames without this framer, while nothing was pending."""
         self._offset += nbytes

@@ -3,7 +3,8 @@
 A group of rows becomes a run if its frames are good data frames that the configuration in force fits, of a stream that
 announces no change, and nothing else of the same round may bear on how they are read: another frame of the same stream,
 anything unusual on the same connection, or, where the configuration is one that another flow of the host has shown,
-any configuration from that host. All other rows become chunks, in the order in which they came.
+a configuration of that IDCODE from that host. Frames that wait for a configuration, as others of their stream do, stay
+together likewise. All other rows become chunks, in the order in which they came.
 """
 
 from __future__ import annotations
@@ -31,13 +32,23 @@ class Candidate(NamedTuple):
 
     number: int
     flow: Flow
-    config: StreamConfig
+    idcode: int
+    config: StreamConfig | None
+    """None: they wait for one."""
     route: Route | None
-    """None: nobody wants it."""
+    """None: nobody wants them."""
 
 
-def harvest(intake: Intake, demux: Demux, routes: Routes) -> tuple[list[Chunk], list[tuple[DataRun, Route | None]]]:
-    """The chunks, to be fed first, and the runs."""
+class Harvest(NamedTuple):
+    """What is to be fed first, one by one; runs, with their routes; and frames that are to wait."""
+
+    chunks: list[Chunk]
+    runs: list[tuple[DataRun, Route | None]]
+    waiting: list[Train]
+
+
+def harvest(intake: Intake, demux: Demux, routes: Routes) -> Harvest:
+    """All that is in the intake's columns."""
     rows = intake.columns.look()
     groups = sorting.group(rows)
     frames = _Frames(rows, groups)
@@ -49,19 +60,28 @@ def harvest(intake: Intake, demux: Demux, routes: Routes) -> tuple[list[Chunk], 
         if len(kept) < len(candidates):
             candidates = kept
             chunks = _chunks(intake, rows, _odd(rows, groups, kept))
-    return chunks, [(frames.run(each), each.route) for each in candidates]
+    found = Harvest(chunks, [], [])
+    for each in candidates:
+        train = frames.train(each)
+        if each.config is not None:
+            found.runs.append((DataRun(train, each.config), each.route))
+        else:
+            found.waiting.append(train)
+    return found
 
 
 def _known(intake: Intake, demux: Demux, routes: Routes, rows: Rows, groups: Groups) -> Iterator[Candidate]:
-    """The groups whose flow and head are those of data frames that a configuration fits."""
+    """The groups whose flow and head are those of data frames that a configuration fits, or that wait for one."""
     firsts = groups.order[groups.starts[:-1]]
     senders, heads = rows.senders[firsts].tobytes(), groups.heads.astype("<u8").tobytes()
     size = rows.senders.shape[1]
     for number, source in enumerate(rows.sources[firsts].tolist()):
         flow = intake.flow(source, senders[number * size : (number + 1) * size])
-        config = demux.fitting(flow, heads[number * 8 : number * 8 + HEAD_BYTES])
-        if config is not None:
-            yield Candidate(number, flow, config, routes.find(flow, config.idcode))
+        head = heads[number * 8 : number * 8 + HEAD_BYTES]
+        config = demux.fitting(flow, head)
+        if config is not None or demux.waits(flow, head):
+            idcode = head[4] << 8 | head[5]
+            yield Candidate(number, flow, idcode, config, routes.find(flow, idcode))
 
 
 def _odd(rows: Rows, groups: Groups, candidates: Sequence[Candidate]) -> NDArray[np.bool_]:
@@ -107,7 +127,8 @@ class _Frames:
         wrong |= np.minimum.reduceat(self._codes, begins) != np.maximum.reduceat(self._codes, begins)
         announcing = np.add.reduceat(self._announcing(candidates), begins, dtype=np.int64)
         told = np.zeros(len(begins), np.bool_)
-        told[[each.number for each in candidates if each.route is not None and each.route.role.announced]] = True
+        routed = ((each.number, each.route) for each in candidates if each.config is not None)
+        told[[number for number, route in routed if route is not None and route.role.announced]] = True
         wrong |= announcing != np.where(told, np.diff(self._groups.starts), 0)
         wrongs = wrong.tolist()
         return [each for each in candidates if not wrongs[each.number]]
@@ -116,7 +137,8 @@ class _Frames:
         """Frames of candidates, among all frames in order, that announce a change."""
         alike: dict[tuple[int, tuple[int, ...]], list[int]] = {}
         for each in candidates:
-            alike.setdefault((self._size[each.number], each.config.stat_offsets), []).append(each.number)
+            if each.config is not None:
+                alike.setdefault((self._size[each.number], each.config.stat_offsets), []).append(each.number)
         found = np.zeros(len(self._groups.order), np.bool_)
         for (place, offsets), numbers in alike.items():
             first, last, octets = self._octets[place]
@@ -126,15 +148,14 @@ class _Frames:
             found[rows + self._starts[first]] = sorting.announcing(octets, offsets)[rows]
         return found
 
-    def run(self, candidate: Candidate) -> DataRun:
+    def train(self, candidate: Candidate) -> Train:
         """The frames of a candidate."""
-        number, flow, config, _ = candidate
+        number = candidate.number
         first, last = self._starts[number], self._starts[number + 1]
         first_group, _, octets = self._octets[self._size[number]]
         base = self._starts[first_group]
         data = octets[first - base : last - base].tobytes()
-        source = SOURCES[self._codes[first]]
-        return DataRun(Train(data, config.frame_size, self._arrivals_ns[first:last], flow, source), config)
+        return Train(data, octets.shape[1], self._arrivals_ns[first:last], candidate.flow, SOURCES[self._codes[first]])
 
 
 @dataclass
@@ -143,34 +164,42 @@ class _Touched:
 
     streams: set[tuple[Flow, int]] = field(default_factory=set)
     connections: set[Flow] = field(default_factory=set)
-    hosts: set[str] = field(default_factory=set)
-    """From which a configuration may have come."""
+    configured: set[tuple[str, int | None]] = field(default_factory=set)
+    """Hosts and IDCODEs of which a configuration has come; None: perhaps of any."""
 
     def concerns(self, candidate: Candidate, demux: Demux) -> bool:
-        flow, idcode = candidate.flow, candidate.config.idcode
+        flow, idcode = candidate.flow, candidate.idcode
         if flow in self.connections or (flow, idcode) in self.streams:
             return True
-        return bool(self.hosts) and _host(flow) in self.hosts and demux.is_borrowed(flow, idcode)
+        if not self.configured or not _takes_others(candidate, demux):
+            return False
+        host = _host(flow)
+        return (host, idcode) in self.configured or (host, None) in self.configured
 
 
 def _touched(chunks: Sequence[Chunk], candidates: Sequence[Candidate], demux: Demux) -> _Touched:
     """Which streams the frames in ``chunks`` belong to, as far as candidates need to know."""
     touched = _Touched()
     flows = {each.flow for each in candidates}
-    hosts = {_host(each.flow) for each in candidates if demux.is_borrowed(each.flow, each.config.idcode)}
+    hosts = {_host(each.flow) for each in candidates if _takes_others(each, demux)}
     framer = Framer(streaming=False)
     for chunk in chunks:
         flow, host = chunk.flow, _host(chunk.flow)
         if flow.is_stream:
             touched.connections.add(flow)
-            touched.hosts.add(host)
+            touched.configured.add((host, None))
         elif flow in flows or host in hosts:
             for frame in framer.feed(chunk.data):
                 if isinstance(frame, Frame):
                     touched.streams.add((flow, frame.idcode))
                     if frame.type.is_config:
-                        touched.hosts.add(host)
+                        touched.configured.add((host, frame.idcode))
     return touched
+
+
+def _takes_others(candidate: Candidate, demux: Demux) -> bool:
+    """Whether its frames may be read by a configuration that another flow shows."""
+    return candidate.config is None or demux.is_borrowed(candidate.flow, candidate.idcode)
 
 
 def _host(flow: Flow) -> str:

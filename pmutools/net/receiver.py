@@ -142,7 +142,8 @@ class Receivers:
             route.hear(part, now_ns)
             out.append(part)
         if not found and self.demux.put_on_hold:
-            self._look_at_held(item.flow, now_ns)
+            for idcode in self.demux.put_on_hold:
+                self._note_held(item.flow, idcode, 1, now_ns)
         elif not found:
             self.routes.note_noise(item)
         return out
@@ -168,11 +169,11 @@ class Receivers:
         if intake is not None and intake.columns.count:
             from pmutools.net.harvest import harvest  # numpy is slow to import, and not all who listen need it
 
-            chunks, runs = harvest(intake, self.demux, self.routes)
-            for chunk in chunks:
+            found = harvest(intake, self.demux, self.routes)
+            for chunk in found.chunks:
                 out += self.parse(chunk)
             now_ns = self._clock.monotonic_ns()
-            for run, route in runs:
+            for run, route in found.runs:
                 if not self.demux.take(run):  # what came before it in the round has changed something
                     out += [part for chunk in run.train.chunks() for part in self.parse(chunk)]
                 elif route is None:
@@ -180,6 +181,11 @@ class Receivers:
                 else:
                     route.hear_alike(run.config, now_ns)
                     out.append(run)
+            for train in found.waiting:
+                if self.demux.hold(train):
+                    self._note_held(train.flow, train.data[4] << 8 | train.data[5], len(train.arrivals_ns), now_ns)
+                else:
+                    out += [part for chunk in train.chunks() for part in self.parse(chunk)]
             intake.clear()
         for item in self._taken():
             if isinstance(item, LinkEvent):
@@ -304,12 +310,11 @@ class Receivers:
             link.listen()
         return intake
 
-    def _look_at_held(self, flow: Flow, now_ns: int) -> None:
+    def _note_held(self, flow: Flow, idcode: int, count: int, now_ns: int) -> None:
         """Data frames that fit no configuration do not come out of the demultiplexer; notice them all the same."""
-        for idcode in self.demux.put_on_hold:
-            if not self.routes.hold(flow, idcode, now_ns):
-                self.unwanted += 1
-                self.demux.ignore(flow, idcode)
+        if not self.routes.hold(flow, idcode, now_ns):
+            self.unwanted += count
+            self.demux.ignore(flow, idcode)
 
     # --- telling
 
