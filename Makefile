@@ -24,6 +24,7 @@ bench: $(VENV)/.dev
 
 soak: $(VENV)/.dev
 	PYTHONPATH=tests $(BIN)/python -m bench.pacing 600
+	PYTHONPATH=tests $(BIN)/python -m bench.characterizing 600
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

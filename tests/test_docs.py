@@ -269,7 +269,11 @@ def test_the_comparison_can_fail() -> None:
 # --- command lines -----------------------------------------------------------------------------------------------
 
 GROUPS = {"pmu": pmu, "dcon": dcon}
-ALIASES = {"stream-player": ("pmu", "play"), "stream-reader": ("pmu", "read")}
+ALIASES = {
+    "stream-player": ("pmu", "play"),
+    "stream-reader": ("pmu", "read"),
+    "network-characterizer": ("pmu", "characterize"),
+}
 OTHERS = frozenset(("python", "head", "nc", "printf"))
 """Programs of others that examples use."""
 

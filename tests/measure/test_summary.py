@@ -204,3 +204,13 @@ def test_two_runs_compared() -> None:
     assert all(row.verdict == "same" for row in compare(before, before))
     back = {(row.stream, row.metric): row.verdict for row in compare(after, before)}
     assert back["N1", "delay_p50"] == "better"
+
+
+def test_every_key_is_defined_in_the_documentation() -> None:
+    from pathlib import Path
+
+    page = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
+    named = {"name", "idcode", "transport", "where", "other_names", "streams"}  # no metrics
+    events = {"events", "own_drops", "corrupt", "diagnoses", "fit", "budget"}  # tables of their own
+    told_keys = {*told()["streams"][0], *told()["all"]} - named - events
+    assert not {key for key in told_keys if f"`{key}`" not in page}

@@ -35,8 +35,8 @@ LEAST_STEP_NS = 100_000
 """A clock that was set by less is not told from reading it twice."""
 CLOCK_NS = 10 * NS
 """How often the receiver's clock is looked after."""
-FIT_NS = 3 * NS
-"""What fitting may take in the end; streams beyond it are told without."""
+FIT_NS = 4 * NS
+"""Fits are made until so long after the end; streams beyond that are told without."""
 LEDGER_NS = 5 * NS
 """How long a ledger is waited for whose player is about to end."""
 _GROUP = 4096
@@ -112,7 +112,7 @@ class Job:
         self._source = source
         self._extra: Callable[[], Mapping[str, Any]] = dict
         self._recorder: Recorder | None = None
-        self._end_ns = 0
+        self._end_ns = self._fit_ns = 0
 
     def live(
         self, source: LiveSource, sample_clock: Callable[[], ClockQuality] | None, observe: Observe = unobserved
@@ -156,11 +156,10 @@ class Job:
         results, courses = self._in_order()
         failures = recorder.failures
         truth = self._truth(results, failures)
-        deadline_ns = self._clock.monotonic_ns() + FIT_NS
         run = self._run(self._end_ns, complete=True)
         departures = None if truth is None else [Departures(a.at_sender, a.one_way) for a in truth.agreements]
         summary = final_summary(
-            engine, results, run, lambda: self._clock.monotonic_ns() < deadline_ns, departures=departures
+            engine, results, run, lambda: self._clock.monotonic_ns() < self._fit_ns, departures=departures
         )
         if truth is not None and settings.ledger is not None:
             summary["ledger"] = truth.to_json(settings.ledger, results)
@@ -208,7 +207,7 @@ class Job:
 
     def _close(self, end_ns: int) -> None:
         assert self._recorder is not None
-        self._end_ns = end_ns
+        self._end_ns, self._fit_ns = end_ns, self._clock.monotonic_ns() + FIT_NS
         self._recorder.close(end_ns)
         self.engine.close()
         self._recorder.finish()
