@@ -227,6 +227,23 @@ def with_station(**said: Any) -> list[Message]:
     return recording(replace(config, stations=(replace(config.stations[0], **said),)), 300, latency_ns=jittery)
 
 
+def leaping() -> list[Message]:
+    """The sender's stamps take a second more than the receiver's clock does, for a while."""
+    messages = recording(stream(), 600, latency_ns=lambda k: jittery(k) + NS * (200 < k < 400))
+    return [messages[0], *(changed(message, 10, b"\x20") for message in messages[1:])]
+
+
+def smeared() -> list[Message]:
+    messages = recording(stream(rate=1), 600, latency_ns=lambda k: jittery(k) + k * 11_600)
+    return [messages[0], *(changed(message, 10, b"\x20") for message in messages[1:])]
+
+
+def forgotten() -> list[Message]:
+    """A multicast group that falls silent after 260 s, and comes back."""
+    flow = PDC._replace(destination="239.1.2.3:4713")
+    return recording(stream(rate=1), 360, latency_ns=jittery, slots=[*range(260), *range(400, 500)], flow=flow)
+
+
 CASES: dict[str, Callable[[], list[Message]]] = {
     "negative-delays": lambda: recording(stream(), 300, latency_ns=lambda k: jittery(k) - 50 * MS),
     "tai-utc": lambda: recording(stream(), 300, latency_ns=lambda k: jittery(k) - 37 * NS),
@@ -249,6 +266,9 @@ CASES: dict[str, Callable[[], list[Message]]] = {
     "odd-time-base": lambda: recording(stream(time_base=0xFFFFFF), 300, latency_ns=jittery),
     "concentrator": lambda: with_station(idcode=61),
     "zero-scale": lambda: with_station(phasors=(replace(stream().stations[0].phasors[0], phunit=0),)),
+    "leap-second": leaping,
+    "leap-smear": smeared,
+    "multicast-ageing": forgotten,
     "config-changed": lambda: [
         *recording(stream(), 300, latency_ns=jittery),
         *recording(stream(cfgcnt=1), 300, latency_ns=jittery, first_slot=300),

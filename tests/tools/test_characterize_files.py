@@ -172,8 +172,6 @@ def test_a_summary_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_a_folder_is_emptied_of_an_earlier_run_alone(tmp_path: Path) -> None:
     for name in ("summary.json", "samples.parquet", "samples.parquet.journal", "intervals.jsonl", "report.html"):
         (tmp_path / name).write_text("old")
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "delay.png").write_text("old")
     (tmp_path / "mine.txt").write_text("kept")
     Folder(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]

@@ -30,7 +30,7 @@ from pmutools.tools.characterizer.wanted import Wanted
 from pmutools.tools.news import USUAL, told
 
 MAX_STREAMS = 4096
-"""So many are measured, at some 400 KiB each; frames of more are counted in ``unmeasured``."""
+"""So many are measured, at some 600 KiB each; frames of more are counted in ``unmeasured``."""
 _FLOWS = 1 << 14
 _MS = 1_000_000
 Sink = Callable[[Gauge, Seen], None]
@@ -107,10 +107,11 @@ class Engine:
 
     def _take_blocks(self, blocks: Iterable[Block]) -> None:
         found: dict[int, list[Block]] = {}
-        for block in blocks:
+        whole = [block for block in blocks if len(block.batch)]
+        if self.begin_ns is None and whole:
+            self.begin_ns = min(_first_ns(block.batch) for block in whole)
+        for block in whole:
             batch = block.batch
-            if not len(batch):
-                continue
             gauge = self._gauge(block.flow, batch.config)
             if gauge is None:
                 self.unmeasured += len(batch)
@@ -124,9 +125,8 @@ class Engine:
                     self._measure(gauge, flow, piece)
 
     def _measure(self, gauge: Gauge, flow: Flow, batch: Batch) -> None:
-        if self.begin_ns is None:
-            self.begin_ns = _first_ns(batch)
         if not gauge.frames:
+            assert self.begin_ns is not None
             gauge.meter.events.first_data_ms = max(0.0, (_first_ns(batch) - self.begin_ns) / _MS)
         linked = any(place in self._links for place in gauge.owners)
         self._emit(gauge, gauge.add(batch, flow, linked=linked))

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 from pathlib import Path
 
 from pmutools.errors import SourceError
 from pmutools.formats.output import cannot_write
 from pmutools.tools.characterizer import samples
 
-SUMMARY, INTERVALS, REPORT, FIGURES = "summary.json", "intervals.jsonl", "report.html", "figures"
+SUMMARY, INTERVALS, REPORT = "summary.json", "intervals.jsonl", "report.html"
 _FILES = (SUMMARY, INTERVALS, REPORT, samples.NAME, samples.NAME + ".journal")
 
 
 class Folder:
-    """Made, and emptied of what an earlier run left. Raises SourceError where the system refuses."""
+    """Made, and rid of the files that an earlier run left. Raises SourceError where the system refuses."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -24,8 +23,6 @@ class Folder:
             path.mkdir(parents=True, exist_ok=True)
             for name in _FILES:
                 (path / name).unlink(missing_ok=True)
-            if (path / FIGURES).is_dir():
-                shutil.rmtree(path / FIGURES)
         except OSError as error:
             raise SourceError(
                 f"cannot make the folder {path}: {error.strerror}; check the place and its rights"
