@@ -120,14 +120,19 @@ def _diagnoses(streams: Sequence[Stream]) -> Iterator[str]:
         for diagnosis in stream["diagnoses"]:
             found.setdefault(diagnosis["id"], []).append((stream["name"], diagnosis["text"]))
     for said in found.values():
-        (name, text), same = said[0], {text for _, text in said}
-        if len(said) == len(streams) > 1 and len(same) == 1:
-            yield f"all streams: {text}"
+        (name, text), names = said[0], [other for other, _ in said]
+        if len(said) > 1 and len({text for _, text in said}) == 1:
+            yield f"{'all streams' if len(said) == len(streams) else _named(names)}: {text}"
             continue
         yield f"{name}: {text}"
-        if others := [other for other, _ in said[1:]]:
-            more = f" and {len(others) - _NAMES} more" if len(others) > _NAMES else ""
-            yield f"  so, with numbers of their own: {', '.join(others[:_NAMES])}{more}"
+        if others := names[1:]:
+            yield f"  so, with numbers of their own: {_named(others)}"
+
+
+def _named(names: Sequence[str]) -> str:
+    """Some of many."""
+    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
+    return ", ".join(names[:_NAMES]) + more
 
 
 def _budget(summary: Mapping[str, Any]) -> Iterator[str]:

@@ -56,9 +56,9 @@ def silent_identity(wanted: Wanted, taken: Iterable[str]) -> Identity:
     (name,) = unique((wanted.label,), taken)
     endpoint = wanted.endpoint
     transport = "tcp" if endpoint.scheme is Scheme.TCP else "udp"
-    return Identity(
-        name, endpoint.idcode or 0, transport, is_multicast(endpoint.host), str(endpoint), wanted.rate, wanted.sites
-    )
+    others = tuple(site for site in wanted.sites if site != name)
+    multicast = is_multicast(endpoint.host)
+    return Identity(name, endpoint.idcode or 0, transport, multicast, str(endpoint), wanted.rate, others)
 
 
 def _to_group(flow: Flow) -> bool:
