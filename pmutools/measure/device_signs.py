@@ -6,7 +6,7 @@ from pmutools.c37118.constants import Format, Stat, stat_trigger_reason
 from pmutools.measure.scene import ENOUGH, Row, Scene
 from pmutools.timebase import NS
 
-_ENOUGH_STEPS = 30
+_ENOUGH_STEPS = 20
 NO_TIME_BASE = 0xFFFFFF
 """All bits of TIME_BASE: a default, more likely than a clock of 16.8 MHz."""
 
@@ -63,7 +63,8 @@ def _rate(scene: Scene) -> str | None:
             f"frames come for every {step}th reporting instant: the device sends {rate / step:g}/s, its "
             f"configuration says {rate:g}/s"
         )
-    if steps.count >= _ENOUGH_STEPS and (steps.quantile(0.02) or 1) > 1:
+    low, high = steps.quantile(0.1) or 1, steps.quantile(0.9) or 1
+    if steps.count >= _ENOUGH_STEPS and (steps.quantile(0.02) or 1) > 1 and high <= 2.5 * low:
         told = rate * slots.received / slots.expected
         return (
             f"no two reporting instants in a row were ever filled: the device sends about {told:.3g}/s, its "
