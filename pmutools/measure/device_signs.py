@@ -58,16 +58,16 @@ def _rate(scene: Scene) -> str | None:
         return "the configuration names no rate (DATA_RATE 0): losses cannot be counted"
     rate = float(result.rate)
     steps = delays.slot_steps
-    if steps.count >= ENOUGH and (step := steps.quantile(0.5) or 1) > 1 and steps.quantile(0.1) == step:
+    if steps.count >= _ENOUGH_STEPS and (step := steps.quantile(0.5) or 1) > 1 and steps.quantile(0.1) == step:
         return (
             f"frames come for every {step}th reporting instant: the device sends {rate / step:g}/s, its "
             f"configuration says {rate:g}/s"
         )
     low, high = steps.quantile(0.1) or 1, steps.quantile(0.9) or 1
-    if steps.count >= _ENOUGH_STEPS and (steps.quantile(0.02) or 1) > 1 and high <= 2.5 * low:
+    if steps.count >= _ENOUGH_STEPS and 1 < low and high <= 2.5 * low:
         told = rate * slots.received / slots.expected
         return (
-            f"no two reporting instants in a row were ever filled: the device sends about {told:.3g}/s, its "
+            f"hardly two reporting instants in a row are ever filled: the device sends about {told:.3g}/s, its "
             f"configuration says {rate:g}/s"
         )
     if slots.conflicting > 0.2 * slots.frames and slots.off_grid > 0.2 * slots.frames and slots.expected:
