@@ -64,7 +64,7 @@ def _rate(scene: Scene) -> str | None:
             f"configuration says {rate:g}/s"
         )
     low, high = steps.quantile(0.1) or 1, steps.quantile(0.9) or 1
-    if steps.count >= _ENOUGH_STEPS and 1 < low and high <= 2.5 * low:
+    if steps.count >= _ENOUGH_STEPS and low > 1 and high <= 2.5 * low:
         told = rate * slots.received / slots.expected
         return (
             f"hardly two reporting instants in a row are ever filled: the device sends about {told:.3g}/s, its "
