@@ -81,7 +81,7 @@ def frames_in(path: Path) -> int:
 def test_columns_are_chosen_and_ordered(pmu: Pmu, tmp_path: Path) -> None:
     out = tmp_path / "log.csv"
     with fed(frames_of(7, 5)) as port:
-        result = pmu("read", url(port), "--out", out, "--fields", "time,*.V1.*,PMU 7.freq_hz", "--duration", 1)
+        result = pmu("read", url(port), "--out", out, "--fields", "time,*.V1.*,PMU 7.freq_hz", "--duration", 0.5)
     assert result.code == 0, result.err
     lines = out.read_text().splitlines()
     assert lines[0] == "time,PMU 7.V1.mag,PMU 7.V1.deg,PMU 7.freq_hz"
@@ -182,7 +182,7 @@ def test_what_goes_to_standard_output_is_nothing_but_data(form: str, capfdbinary
     from pmutools.cli.shell import run
 
     with fed(frames_of(7, 20)) as port:
-        code = run(group(), ["read", url(port), "--out", "-", "--format", form, "--duration", "1", "--json"])
+        code = run(group(), ["read", url(port), "--out", "-", "--format", form, "--duration", "0.5", "--json"])
     out, err = capfdbinary.readouterr()
     assert code == 0, err
     assert READERS[form](out) == 20
@@ -195,7 +195,7 @@ def test_what_goes_to_standard_output_is_nothing_but_data(form: str, capfdbinary
 @pytest.mark.parametrize("suffix", [".pcapng", ".jsonl.gz", ".csv"])
 def test_a_file_for_each_stream(suffix: str, pmu: Pmu, tmp_path: Path) -> None:
     with fed(frames_of(7, 10), frames_of(8, 20)) as port:
-        result = pmu("read", url(port), "--out", tmp_path / f"log{suffix}", "--per-stream", "--duration", 1, "--json")
+        result = pmu("read", url(port), "--out", tmp_path / f"log{suffix}", "--per-stream", "--duration", 0.5, "--json")
     assert result.code == 0, result.err
     names = {Path(path).name: frames_in(Path(path)) for path in result.json["paths"]}
     assert names == {f"PMU_7-7{suffix}": 10, f"PMU_8-8{suffix}": 20}
@@ -209,7 +209,7 @@ def test_streams_of_an_initialisation_file_have_its_names(pmu: Pmu, tmp_path: Pa
             "[controller]\ngain_mw_per_mhz = 9\n"
         )
         out = tmp_path / "log.parquet"
-        result = pmu("read", "--ini", ini, "--out", out, "--duration", 1, "--json")
+        result = pmu("read", "--ini", ini, "--out", out, "--duration", 0.5, "--json")
     assert result.code == 0, result.err
     assert sorted(path.name for path in (tmp_path / "log").iterdir()) == ["North_1.parquet", "S.parquet"]
     assert [each["frames"] for each in result.json["streams"]] == [10, 20]
@@ -253,7 +253,7 @@ def test_an_excursion_is_recorded_with_what_came_before(pmu: Pmu, tmp_path: Path
 
 def test_a_trigger_that_fits_nothing_is_told_in_the_end(pmu: Pmu, tmp_path: Path) -> None:
     with fed(frames_of(7, 10)) as port:
-        arguments = ("--trigger", "Z9.freq>1,loss", "--duration", 1)
+        arguments = ("--trigger", "Z9.freq>1,loss", "--duration", 0.5)
         result = pmu("read", url(port), "--out", tmp_path / "event.csv", *arguments)
     assert result.code == 0, result.err
     assert "--trigger: Z9.freq>1 has fitted no station or channel of the streams that came" in result.err
@@ -262,11 +262,16 @@ def test_a_trigger_that_fits_nothing_is_told_in_the_end(pmu: Pmu, tmp_path: Path
 
 
 def test_a_signal_records(pmu: Pmu, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGUSR1)
+
     def ask() -> None:
-        time.sleep(0.4)  # the frames are in the history by then, or come with the event
+        deadline = time.monotonic() + PATIENCE_S
+        while signal.getsignal(signal.SIGUSR1) is before:  # it would end this process
+            if time.monotonic() > deadline:
+                return
+            time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGUSR1)
 
-    before = signal.getsignal(signal.SIGUSR1)
     with fed(frames_of(7, 30), then=ask) as port:
         result = pmu(
             "read", url(port), "--out", tmp_path / "event.csv", "--trigger", "signal", "--duration", 2, "--json"
@@ -312,7 +317,7 @@ def test_a_key_records(tmp_path: Path) -> None:
 
 def test_the_summary_tells_each_stream(pmu: Pmu, tmp_path: Path) -> None:
     with fed(frames_of(7, 10), frames_of(8, 20)) as port:
-        result = pmu("read", url(port), "--out", tmp_path / "log.mcap", "--duration", 1, "--json")
+        result = pmu("read", url(port), "--out", tmp_path / "log.mcap", "--duration", 0.5, "--json")
     assert result.code == 0, result.err
     told = result.json
     assert (told["frames"], told["skipped"], told["own_drops"]) == (30, {}, 0)

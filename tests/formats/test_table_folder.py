@@ -205,3 +205,20 @@ def rows_of(path: Path) -> dict[tuple[int, str | None, str], list[dict[str, Any]
     for row in table.to_pylist():
         found.setdefault((row["idcode"], row["channel"], row["quantity"]), []).append(row)
     return found
+
+
+# --- memory ------------------------------------------------------------------------------------------------------
+
+
+def test_what_waits_in_memory_is_written_when_it_is_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though that makes small row groups; without it, these would be one."""
+    from pyarrow import parquet
+
+    monkeypatch.setattr("pmutools.formats.table_sink.HELD_BYTES", 1000)
+    with open_sink(tmp_path / "out.parquet") as sink:
+        for block in gather(stream(7), 5):
+            if isinstance(block, Block):
+                sink.write(block)
+                sink.flush()
+    assert parquet.ParquetFile(tmp_path / "out.parquet").num_row_groups == 4
+    assert len(data_of(read(tmp_path / "out.parquet"))) == 20
