@@ -27,7 +27,9 @@ from pmutools.linux_columns import SendColumns
 from pmutools.net.sockets import Address, pack_sockaddr
 from pmutools.tools.live import LiveSource
 
-FIRST_PORT = 45_000
+FIRST_PORT = 20_000
+"""Below those that the system gives away."""
+LAYOUTS = {layout.name: layout for layout in (A, C)}
 WARM_UP_S = 0.5
 TICKS = 1000
 """Times a second at which the sender sends what is due: its streams are spread evenly over the reporting interval."""
@@ -111,7 +113,7 @@ def _measured(source: LiveSource, seconds: float) -> Cost:
 def _sending(target: object, *arguments: object) -> Iterator[None]:
     context = multiprocessing.get_context("spawn")
     ready, end = context.Event(), context.Event()
-    process = context.Process(target=target, args=(*arguments, ready, end))  # type: ignore[arg-type]
+    process = context.Process(target=target, args=(*arguments, ready, end), daemon=True)  # type: ignore[arg-type]
     process.start()
     try:
         assert ready.wait(20), "no sender"
@@ -119,6 +121,7 @@ def _sending(target: object, *arguments: object) -> Iterator[None]:
     finally:
         end.set()
         process.join(10)
+        process.kill()
 
 
 def _frames(streams: int, layout: Layout) -> tuple[list[bytes], np.ndarray]:
@@ -132,8 +135,7 @@ def _frames(streams: int, layout: Layout) -> tuple[list[bytes], np.ndarray]:
 
 
 def _send(streams: int, ports: int, name: str, ready: Event, end: Event) -> None:
-    layout = {"A": A, "C": C}[name]
-    configs, data = _frames(streams, layout)
+    configs, data = _frames(streams, LAYOUTS[name])
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 << 20)
     sock.bind(("127.0.0.1", 0))
@@ -153,9 +155,9 @@ def _send(streams: int, ports: int, name: str, ready: Event, end: Event) -> None
 
 
 def _serve(connections: int, name: str, ready: Event, end: Event) -> None:
-    layout = {"A": A, "C": C}[name]
-    configs, data = _frames(connections, layout)
+    configs, data = _frames(connections, LAYOUTS[name])
     with socket.create_server(("127.0.0.1", FIRST_PORT), backlog=1024) as listener:
+        listener.settimeout(20)
         ready.set()
         clients: list[socket.socket | None] = [None] * connections
         for _ in range(connections):

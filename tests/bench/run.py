@@ -16,7 +16,7 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # processor time is counted: idle threads must not spin
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench import capture, characterizing, codec, control, measuring, pacing, startup, table
+from bench import capture, codec, control, measuring, pacing, receiving, startup, table
 from bench.layouts import BLOCK, LAYOUTS
 from bench.table import Row
 
@@ -31,7 +31,7 @@ def measured(*, quick: bool) -> Iterator[Row]:
     yield from startup.rows(startup.QUICK if quick else startup.FULL)
     yield from control.rows(control.QUICK if quick else control.FULL)
     yield from measuring.rows(measuring.QUICK if quick else measuring.FULL)
-    yield from characterizing.rows(characterizing.QUICK if quick else characterizing.FULL)
+    yield from receiving.rows(receiving.QUICK if quick else receiving.FULL)
     yield from pacing.rows(pacing.QUICK if quick else pacing.FULL)
 
 

@@ -8,10 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bench import capture, characterizing, codec, control, measuring, pacing, startup, table
-from bench.layouts import BLOCK, LAYOUTS, B, C, Layout
+from bench import capture, codec, control, measuring, pacing, receiving, startup, table
+from bench.layouts import BLOCK, LAYOUTS, A, B, C, Layout
 from bench.stopwatch import Rate
 from bench.table import Budget, Row
+
+from pmutools import linux
 
 NAMES = [layout.name for layout in LAYOUTS]
 
@@ -62,6 +64,15 @@ def test_the_player_is_watched_beside_tcpreplay(requires: Callable[[str], Path])
     rows = list(pacing.rows(pacing.QUICK))
     assert len(rows) == 4
     assert all(row.budget is not None and row.group == "player" for row in rows)
+
+
+@pytest.mark.realtime
+@pytest.mark.skipif(not linux.NATIVE, reason="the sender needs sendmmsg")
+def test_receiving_is_measured_over_udp_and_tcp() -> None:
+    for cost in (receiving.taken(20, 10, A, 0.3), receiving.connected(5, A, 0.3)):
+        assert cost.frames > 0
+        assert 0 < cost.cpu_s < cost.wall_s * 2
+        assert cost.us > 0
 
 
 def test_a_ratio_is_that_of_the_rounds() -> None:
