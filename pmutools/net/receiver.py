@@ -115,6 +115,7 @@ class Receivers:
 
     def poll(self, timeout_ns: int | None) -> list[Chunk | LinkEvent]:
         """What has arrived and happened; waits for it at most ``timeout_ns`` (0: not at all, None: for ever)."""
+        assert self._plumbing.intake is None, "these are soaked"
         self._reactor.run(0 if self._out else timeout_ns)
         return self._taken()
 

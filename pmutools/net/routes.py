@@ -157,7 +157,7 @@ class Routes:
                 if first is None or second is None:
                     del listener.rivals[idcode]
                     continue
-                both_ns = min(first.role.heard_ns, second.role.heard_ns)
+                both_ns = max(min(first.role.heard_ns, second.role.heard_ns), rivals.since_ns)
                 if both_ns - rivals.since_ns > RIVALRY_NS:
                     del listener.rivals[idcode]
                     listener.duplicated.add(idcode)

@@ -30,7 +30,7 @@ class Bench:
 
     def __init__(self, *queries: str) -> None:
         port = free_udp_port()
-        self.clock = VirtualClock()
+        self.clock = VirtualClock(monotonic_ns=10**15)
         endpoints = [parse_endpoint(f"udp://127.0.0.1:{port}{query}") for query in queries]
         self.receivers = Receivers(endpoints, self.clock)
         self.local = f"127.0.0.1:{port}"
@@ -79,14 +79,16 @@ def both_send(found: Bench, config: StreamConfig, seconds: int, *sources: str) -
 def test_two_senders_of_one_idcode_are_told_once() -> None:
     with bench() as found:
         config = stream(7)
-        for source in ("10.0.0.1:4713", "10.0.0.2:4713"):
-            found.send(source, encode_config(config))
+        found.send("10.0.0.1:4713", encode_config(config), *frames(config))
+        found.wait(NS)
+        found.send("10.0.0.2:4713", encode_config(config))  # its data come later
+        found.wait(NS)
         both_send(found, config, 30, "10.0.0.1:4713", "10.0.0.2:4713")
         (told,) = found.of(LinkKind.DUPLICATE)
         assert "IDCODE 7 comes from 10.0.0.1:4713 and from 10.0.0.2:4713" in told.detail
         assert "?source=" in told.detail
         assert (told.owners, told.idcode) == ((0,), 7)
-        assert len(found.frames) == 2 + 120, "both are heard all the same"
+        assert len(found.frames) == 3 + 120, "both are heard all the same"
 
 
 def test_a_sender_that_was_restarted_is_no_duplicate() -> None:
