@@ -42,14 +42,14 @@ class HostLog:
     """Stalls and steps of the clock, from beats that should come every :data:`BEAT_NS`. Its clock is read in beats."""
 
     def __init__(self, clock: Clock) -> None:
-        self.stalls: deque[Stall] = deque(maxlen=KEPT)
         self.stalled = 0
         """Stalls so far, and how long they were together."""
         self.stalled_ns = 0
-        self.steps: deque[ClockStep] = deque(maxlen=KEPT)
         self.stepped = 0
         """Steps so far."""
         self._clock = clock
+        self._stalls: deque[Stall] = deque(maxlen=KEPT)
+        self._steps: deque[ClockStep] = deque(maxlen=KEPT)
         self._news: deque[Stall | ClockStep] = deque(maxlen=KEPT)
         self.start()
 
@@ -57,6 +57,16 @@ class HostLog:
         """Beats begin, or begin again."""
         self._last_ns = self._clock.monotonic_ns()
         self._offset: UtcOffset = utc_offset(self._clock, 3)
+
+    @property
+    def stalls(self) -> tuple[Stall, ...]:
+        """The last :data:`KEPT` of them."""
+        return tuple(self._stalls)
+
+    @property
+    def steps(self) -> tuple[ClockStep, ...]:
+        """The last :data:`KEPT` of them."""
+        return tuple(self._steps)
 
     def news(self) -> Iterator[Stall | ClockStep]:
         """What has happened since this was last asked."""
@@ -71,7 +81,7 @@ class HostLog:
             self.stalled += 1
             self.stalled_ns += gap_ns
             stall = Stall(now_ns - gap_ns, self._offset.realtime_ns(now_ns - gap_ns), gap_ns)
-            self.stalls.append(stall)
+            self._stalls.append(stall)
             self._news.append(stall)
         if now_ns - self._offset.at_ns >= CLOCK_LOOK_NS:
             self._look_at_clock()
@@ -83,7 +93,7 @@ class HostLog:
         if abs(step_ns) > STEP_NS:
             self.stepped += 1
             step = ClockStep(later.at_ns, later.realtime_ns(later.at_ns), step_ns)
-            self.steps.append(step)
+            self._steps.append(step)
             self._news.append(step)
 
 
