@@ -145,7 +145,7 @@ class Receivers:
         if not found and self.demux.put_on_hold:
             for idcode in self.demux.put_on_hold:
                 self._note_held(item.flow, idcode, 1, now_ns)
-        elif not found:
+        elif not found and item.data:
             self.routes.note_noise(item)
         return out
 

@@ -139,12 +139,13 @@ class Routes:
         return True
 
     def note_noise(self, chunk: Chunk) -> None:
-        """A chunk came in which nothing begins that could be a frame, from a flow that has shown none yet."""
-        start = f"{chunk.data[:SHOWN_BYTES].hex(' ')}{' ...' if len(chunk.data) > SHOWN_BYTES else ''}"
+        """A chunk came in which no frame was found, from a flow that has shown none yet, or may yet end one."""
         if (link := self._plumbing.links.get(chunk.flow)) is not None:
-            link.noise = link.noise or start
+            link.noise = link.noise or _beginning(chunk.data)
         elif (listener := self._by_local.get(chunk.flow.destination)) is not None and not listener.noise:
-            listener.noise = f"{len(chunk.data)} bytes from {chunk.flow.source} are no C37.118: {start}"
+            listener.noise = (
+                f"{len(chunk.data)} bytes from {chunk.flow.source} are no C37.118: {_beginning(chunk.data)}"
+            )
             detail = f"{listener.noise}; does something else send to this port?"
             where = f"udp://{chunk.flow.destination}"
             self.notices.tell(LinkEvent(LinkKind.NOISE, where, listener.owners, detail, flow=chunk.flow))
@@ -259,3 +260,7 @@ class Routes:
         detail = f"IDCODE {idcode} comes from {one} and from {other}; take one out, or name the right one by ?source="
         where = f"udp://{rivals.second.destination}"
         self.notices.tell(LinkEvent(LinkKind.DUPLICATE, where, route.owners, detail, idcode, rivals.second))
+
+
+def _beginning(data: bytes) -> str:
+    return f"{data[:SHOWN_BYTES].hex(' ')}{' ...' if len(data) > SHOWN_BYTES else ''}"
