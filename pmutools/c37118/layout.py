@@ -141,7 +141,7 @@ _known: WeakValueDictionary[tuple[object, ...], Layout] = WeakValueDictionary()
 """Layouts in use, by what they are made of."""
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1 << 16)  # as many streams as a receiver knows; layouts are few
 def layout_of(config: StreamConfig) -> Layout:
     """The layout of ``config``'s data frames, made once a configuration.
 
@@ -259,16 +259,20 @@ def block_dtype(fields: Sequence[Field]) -> np.dtype[np.void]:
     return np.dtype(columns)
 
 
-@lru_cache(maxsize=4096)
 def dtype_of(config: StreamConfig) -> np.dtype[np.void]:
     """Big-endian dtype of one data frame; ``itemsize`` is FRAMESIZE.
 
     Fields ``sync framesize idcode soc fracsec``, one nested :func:`block_dtype` a station as ``s0, s1, ...``, ``chk``.
     """
+    return _dtype_of(layout_of(config))
+
+
+@lru_cache(maxsize=4096)
+def _dtype_of(layout: Layout) -> np.dtype[np.void]:
     import numpy as np
 
     head = [("sync", ">u2"), ("framesize", ">u2"), ("idcode", ">u2"), ("soc", ">u4"), ("fracsec", ">u4")]
-    blocks = [(f"s{number}", block_dtype(fields)) for number, fields in enumerate(layout_of(config).stations)]
+    blocks = [(f"s{number}", block_dtype(fields)) for number, fields in enumerate(layout.stations)]
     dtype: np.dtype[np.void] = np.dtype([*head, *blocks, ("chk", ">u2")])
-    assert dtype.itemsize == config.frame_size
+    assert dtype.itemsize == layout.frame_size
     return dtype

@@ -43,6 +43,7 @@ from pmutools.c37118.config import (
 from pmutools.c37118.constants import Format
 from pmutools.c37118.framer import Frame, SkipReason
 from pmutools.c37118.frames import wire_values
+from pmutools.c37118.layout import layout_of
 from pmutools.c37118.prefix import Prefix
 from pmutools.errors import ChecksumError, ConfigError, EncodeError, LengthError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
@@ -429,3 +430,23 @@ def test_a_phasor_beyond_both_ends_of_its_integers_does_not_read_as_absent() -> 
     assert clipped == 2
     (back,) = decode_batch(octets.tobytes(), config).phasors[0]
     assert back == -32767 - 32767j
+
+
+def test_streams_that_are_laid_out_alike_share_their_layout() -> None:
+    """So that their frames can be decoded together; whatever bears on decoding tells them apart."""
+    one = StreamConfig(1, (Station("A", 1, Format.POLAR, (PhasorChannel("VA", 100),)),), 50)
+    station = one.stations[0]
+    alike = [
+        replace(one, idcode=2, data_rate=25),
+        replace(one, stations=(replace(station, name="B", idcode=9, cfgcnt=4),)),
+        replace(one, stations=(replace(station, phasors=(PhasorChannel("IA", 100 | 1 << 24),)),)),
+    ]
+    apart = [
+        replace(one, time_base=1000),
+        replace(one, stations=(replace(station, fnom=1),)),
+        replace(one, stations=(replace(station, format=Format(0)),)),
+        replace(one, stations=(replace(station, phasors=(PhasorChannel("VA", 101),)),)),
+        replace(one, stations=(station, station)),
+    ]
+    assert {layout_of(config) for config in (one, *alike)} == {layout_of(one)}
+    assert len({layout_of(config) for config in (one, *apart)}) == 1 + len(apart)
