@@ -35,6 +35,13 @@ def low(index: int, bits: int) -> int:
     return index - (shift << bits) << shift
 
 
+def lows(indices: npt.NDArray[np.int64], bits: int) -> npt.NDArray[np.int64]:
+    """:func:`low` of bins (N,)."""
+    shift = np.maximum((indices >> bits) - 1, 0)
+    found: npt.NDArray[np.int64] = indices - (shift << bits) << shift
+    return found
+
+
 def high(index: int, bits: int) -> int:
     """The largest number of a bin."""
     return low(index + 1, bits) - 1

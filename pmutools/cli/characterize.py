@@ -18,6 +18,7 @@ from pmutools.cli.shell import Exit, Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION, is_live
 from pmutools.errors import SettingsError, SourceError
 from pmutools.timebase import NS
+from pmutools.tools.characterizer.names import FILES
 
 if TYPE_CHECKING:
     from pmutools.c37118.config import StreamConfig
@@ -126,6 +127,9 @@ def _check(asked: Asked) -> None:
         raise SettingsError(f"{targets[0]} and {targets[-1]}: live streams or recordings, not both at once")
     if asked.no_samples and asked.ledger is not None:
         raise SettingsError("--ledger needs the samples: leave out --no-samples")
+    for path in filter(None, (*map(Path, targets), asked.ini, asked.ledger)):
+        if path.name in FILES and path.exists() and out.exists() and path.resolve().parent.samefile(out):
+            raise SettingsError(f"{path} is an input, and would be overwritten; write to another folder than {out}")
     if before is not None and before.exists() and out.exists() and before.samefile(out):
         raise SettingsError(f"--compare {before} is --out too, and would be overwritten; write to another folder")
 

@@ -25,7 +25,7 @@ def _period(scene: Scene) -> str | None:
         return f"the delay, {ms_text(middle)}, is one reporting period of {ms_text(period)}: {why}"
     seen = {}
     for other in scene.others:
-        if other.rate and other.middle_ns is not None and other.middle_ns > 0:
+        if other.middle_ns > 0:
             seen[other.rate] = other.middle_ns * other.rate / NS
     if len(seen) < 2 or not 0.4 <= periods <= 10 or max(seen) < 1.5 * min(seen):
         return None

@@ -62,7 +62,7 @@ def error_ns(value_ns: float) -> float:
 class Histogram:
     """How often each duration came. ``merge`` of two is the histogram of all their values, to the last count."""
 
-    __slots__ = ("_m2", "_mean", "_pages", "_type", "count", "max_ns", "min_ns")
+    __slots__ = ("_kept", "_m2", "_mean", "_pages", "_type", "count", "max_ns", "min_ns")
 
     def __init__(self, values_ns: npt.ArrayLike = ()) -> None:
         self.count = 0
@@ -71,6 +71,8 @@ class Histogram:
         self._mean, self._m2 = 0.0, 0.0
         self._pages: dict[int, npt.NDArray[Any]] = {}
         self._type: type[np.integer[Any]] = np.uint32
+        self._kept: tuple[Ints, Ints, Ints] | None = None
+        """What :meth:`_filled` found since the last value came, and the sums of its counts."""
         self.add(np.asarray(values_ns, np.int64))
 
     def add(self, values_ns: Ints) -> None:
@@ -105,6 +107,7 @@ class Histogram:
     def _combine(self, count: int, mean: float, m2: float, low: int, high: int) -> None:
         """Take in the moments of ``count`` more values (Chan, Golub and LeVeque 1979)."""
         total = self.count + count
+        self._kept = None
         step = mean - self._mean if self.count else 0.0
         self._m2 += m2 + step * step * (self.count * count / total)
         self._mean = self._mean + step * (count / total) if self.count else mean
@@ -144,11 +147,21 @@ class Histogram:
 
     def bins(self) -> Bins:
         """What is in the histogram."""
-        indices, counts = self._filled()
-        edges = np.array([_edges(index) for index in indices.tolist()], np.int64).reshape(-1, 2)
-        return Bins(edges[:, 0], edges[:, 1], counts)
+        indices, counts, _ = self._filled()
+        size = np.abs(indices)
+        near = loglinear.lows(size, BITS) * RESOLUTION_NS - RESOLUTION_NS // 2
+        far = (loglinear.lows(size + 1, BITS) - 1) * RESOLUTION_NS + RESOLUTION_NS // 2
+        below = indices < 0
+        return Bins(np.where(below, -far, near), np.where(below, -near, far), counts)
 
-    def _filled(self) -> tuple[Ints, Ints]:
+    def _filled(self) -> tuple[Ints, Ints, Ints]:
+        """Indices of the bins that hold anything, their counts, and the sums of these."""
+        if self._kept is None:
+            indices, counts = self._found()
+            self._kept = indices, counts, np.cumsum(counts)
+        return self._kept
+
+    def _found(self) -> tuple[Ints, Ints]:
         if not self._pages:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         numbers = sorted(self._pages)
@@ -169,8 +182,7 @@ class Histogram:
         """:meth:`quantile_ns` of several shares."""
         if not self.count + lost:
             return [None] * len(shares)
-        indices, counts = self._filled()
-        seen = np.cumsum(counts)
+        indices, _, seen = self._filled()
         found: list[float | None] = []
         for share in shares:
             rank = max(1, math.ceil(share * (self.count + lost) - 1e-9))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from statistics import median_low
 from typing import NamedTuple
 
 from pmutools.measure.clockquality import ClockLog
@@ -16,15 +17,20 @@ ENOUGH = 50
 
 
 class Peer(NamedTuple):
-    """What is asked of another stream: its rate, frames/s, and its median delay, None of too few frames."""
+    """What is asked of other streams: their rate, frames/s, and their median delay."""
 
     rate: float
-    middle_ns: float | None
+    middle_ns: float
 
 
-def peer_of(result: StreamResult) -> Peer:
-    """A stream as the others see it."""
-    return Peer(float(result.rate), _middle(result))
+def peers_of(results: Sequence[StreamResult]) -> tuple[Peer, ...]:
+    """Streams as each of them sees all: one a rate, whose delay is the median of their medians."""
+    found: dict[float, list[float]] = {}
+    for result in results:
+        middle = _middle(result)
+        if result.rate and middle is not None:
+            found.setdefault(float(result.rate), []).append(middle)
+    return tuple(Peer(rate, median_low(middles)) for rate, middles in sorted(found.items()))
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class Scene:
     result: StreamResult
     clock: ClockLog = field(default_factory=ClockLog)
     others: Sequence[Peer] = ()
-    """All streams of the run, this one among them."""
+    """All streams of the run, this one among them, by rate."""
 
     @property
     def middle_ns(self) -> float | None:

@@ -15,7 +15,7 @@ from pmutools.measure.diagnoses import diagnose
 from pmutools.measure.fits import best_fit, typical
 from pmutools.measure.histogram import ms
 from pmutools.measure.quality import Events
-from pmutools.measure.scene import Peer, Scene, peer_of
+from pmutools.measure.scene import Peer, Scene, peers_of
 from pmutools.measure.stream import StreamCounts, StreamResult
 from pmutools.measure.uncertainty import uncertainty
 
@@ -33,7 +33,7 @@ def summary(
     ``host`` is what happened that belongs to no stream alone, with all drops of this machine's sockets: streams that
     share one were each told of the same drops.
     """
-    peers, whole = [peer_of(result) for result in results], Whole()
+    peers, whole = peers_of(results), Whole()
     streams = []
     for result in results:
         streams.append(stream_summary(result, clock, peers, fit=fits))

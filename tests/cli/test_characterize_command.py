@@ -355,6 +355,15 @@ def test_the_folder_of_the_earlier_run_is_not_overwritten(tmp_path: Path) -> Non
     assert (tmp_path / "run" / "summary.json").read_bytes() == before
 
 
+def test_an_input_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "samples.parquet"
+    write(path, recording(stream(), 10, latency_ns=20 * MS))
+    before = path.read_bytes()
+    result = run_here("characterize", path, "--out", tmp_path)
+    assert result.code == 2 and "is an input, and would be overwritten" in result.complaint
+    assert path.read_bytes() == before
+
+
 def test_a_capture_of_something_else_fails_and_says_so(foreign: Path, tmp_path: Path) -> None:
     result = run_here("characterize", foreign, "--out", tmp_path / "run", "--no-report", "--quiet")
     assert result.code == 1

@@ -14,7 +14,7 @@ from pmutools.c37118.constants import Format
 from pmutools.flow import StampSource
 from pmutools.measure.clockquality import ClockLog, ClockQuality, KernelClock
 from pmutools.measure.diagnoses import ROWS, diagnose
-from pmutools.measure.scene import Peer, Scene, peer_of
+from pmutools.measure.scene import Peer, Scene, peers_of
 from pmutools.measure.stream import Identity, StreamMeter, StreamResult
 from pmutools.timebase import NS
 
@@ -58,7 +58,7 @@ def with_events(**counted: Any) -> StreamResult:
 
 
 def peers(*results: StreamResult) -> tuple[Peer, ...]:
-    return tuple(map(peer_of, results))
+    return peers_of(results)
 
 
 def silent_after(seconds: float) -> StreamResult:

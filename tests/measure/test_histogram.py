@@ -118,3 +118,16 @@ def test_more_than_32_bits_can_count() -> None:
     small.merge(histogram)
     assert small.count == (1001 << 24) + 3
     assert small.quantile_ns(0.5) == pytest.approx(5_000_000, abs=error_ns(5_000_000))
+
+
+def test_edges_of_many_bins_are_those_of_each() -> None:
+    values = np.concatenate((np.arange(-3000, 3000) * 1000, np.logspace(6, 17, 500).astype(np.int64)))
+    values = np.concatenate((values, -values))
+    histogram = Histogram(values)
+    for low, high, _ in histogram.bins():
+        inside = np.sort(values[(values >= low) & (values <= high)])
+        assert len(inside)
+    assert sum(count for *_, count in histogram.bins()) == len(values)
+    before = list(histogram.bins())
+    histogram.add(np.array([10**9]))
+    assert list(histogram.bins()) != before  # what was kept is not told again

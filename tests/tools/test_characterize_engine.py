@@ -19,7 +19,7 @@ from pmutools.c37118.framer import Skipped, SkipReason
 from pmutools.flow import Flow, StampSource
 from pmutools.formats.source import Block
 from pmutools.measure.clockquality import ClockQuality, KernelClock
-from pmutools.measure.scene import peer_of
+from pmutools.measure.scene import peers_of
 from pmutools.measure.stream import StreamResult
 from pmutools.measure.summary import stream_summary
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -63,7 +63,7 @@ def results(engine: Engine, end_ns: int | None = None) -> dict[str, StreamResult
 
 
 def ids(engine: Engine, result: StreamResult) -> set[str]:
-    return {row["id"] for row in stream_summary(result, engine.clock, [peer_of(result)], fit=False)["diagnoses"]}
+    return {row["id"] for row in stream_summary(result, engine.clock, peers_of([result]), fit=False)["diagnoses"]}
 
 
 # --- whose it is

@@ -20,7 +20,8 @@ from pmutools.timebase import NS
 from pmutools.tools.characterizer.chores import Chores
 from pmutools.tools.characterizer.chronicle import FIRST, LAST, Chronicle
 from pmutools.tools.characterizer.engine import Engine
-from pmutools.tools.characterizer.folder import SUMMARY, Folder
+from pmutools.tools.characterizer.folder import Folder
+from pmutools.tools.characterizer.names import SUMMARY
 from pmutools.tools.characterizer.recorder import Recorder
 from pmutools.tools.characterizer.samples import Samples
 from pmutools.tools.characterizer.telling import run_part

@@ -8,10 +8,7 @@ from pathlib import Path
 
 from pmutools.errors import SourceError
 from pmutools.formats.output import cannot_write
-from pmutools.tools.characterizer import samples
-
-SUMMARY, INTERVALS, REPORT = "summary.json", "intervals.jsonl", "report.html"
-_FILES = (SUMMARY, INTERVALS, REPORT, samples.NAME, samples.NAME + ".journal")
+from pmutools.tools.characterizer.names import FILES
 
 
 class Folder:
@@ -21,7 +18,7 @@ class Folder:
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)
-            for name in _FILES:
+            for name in FILES:
                 (path / name).unlink(missing_ok=True)
         except OSError as error:
             raise SourceError(

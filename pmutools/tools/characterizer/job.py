@@ -24,8 +24,9 @@ from pmutools.measure.stream import WAIT_NS, StreamResult
 from pmutools.measure.timeline import Course
 from pmutools.timebase import NS
 from pmutools.tools.characterizer.engine import Engine
-from pmutools.tools.characterizer.folder import SUMMARY, Folder
+from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.hostwatch import HostWatch
+from pmutools.tools.characterizer.names import SUMMARY
 from pmutools.tools.characterizer.recorder import Recorder
 from pmutools.tools.characterizer.telling import final_summary, results_of, run_part
 from pmutools.tools.characterizer.truth import Truth, hold_to

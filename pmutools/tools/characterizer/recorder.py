@@ -15,8 +15,9 @@ from pmutools.formats.output import OutputFile
 from pmutools.timebase import NS
 from pmutools.tools.characterizer.chores import Chores
 from pmutools.tools.characterizer.engine import Engine
-from pmutools.tools.characterizer.folder import INTERVALS, SUMMARY, Folder
+from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.intervals import Intervals
+from pmutools.tools.characterizer.names import INTERVALS, SUMMARY
 from pmutools.tools.characterizer.samples import Samples
 from pmutools.tools.characterizer.telling import checkpoint
 

@@ -22,11 +22,11 @@ from pmutools.formats.output import OutputFile
 from pmutools.formats.parquet import ParquetRows
 from pmutools.measure.stream import STATES, Seen, State
 from pmutools.tools.characterizer.gauge import Gauge
+from pmutools.tools.characterizer.names import SAMPLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-NAME = "samples.parquet"
 AT_ONCE = 1 << 14
 """Rows are made into columns so many at a time."""
 _LOST = STATES.index(State.LOST)
@@ -37,7 +37,7 @@ class Samples:
     """Takes what gauges see. Raises SourceError where the system refuses to write."""
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
+        self.path = folder / SAMPLES
         self._schema = _schema()
         self._file = OutputFile(self.path)
         self._rows = ParquetRows(self._file, self._schema)

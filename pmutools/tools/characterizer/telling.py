@@ -9,7 +9,7 @@ from typing import Any
 from pmutools import __version__, timebase
 from pmutools.measure.budget import Departures
 from pmutools.measure.completeness import Alignment
-from pmutools.measure.scene import Peer, peer_of
+from pmutools.measure.scene import peers_of
 from pmutools.measure.stream import StreamResult
 from pmutools.measure.summary import Whole, safe, stream_summary
 from pmutools.tools.characterizer.engine import Engine
@@ -83,7 +83,7 @@ def final_summary(
     departures: Sequence[Departures] | None = None,
 ) -> dict[str, Any]:
     """The summary of a run that is over, as it will be written; fits as long as ``may_fit`` says so."""
-    peers: list[Peer] = [peer_of(result) for result in results]
+    peers = peers_of(results)
     whole, streams = Whole(), []
     for number, result in enumerate(results):
         known = None if departures is None else departures[number]
