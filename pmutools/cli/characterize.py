@@ -241,7 +241,7 @@ def _report(outcome: Outcome, asked: Asked, talk: Talk) -> None:
     """The report and the figures, where what they need is installed."""
     from pmutools.report import write_report
     from pmutools.report.intervals import read_intervals
-    from pmutools.tools.characterizer.folder import INTERVALS
+    from pmutools.tools.characterizer.names import INTERVALS
 
     talk.progress("writing the report")
     run = replace(

@@ -41,7 +41,7 @@ class Samples:
         self._schema = _schema()
         self._file = OutputFile(self.path)
         self._rows = ParquetRows(self._file, self._schema)
-        self._journal = _Journal(self.path.with_name(NAME + JOURNAL), self._schema)
+        self._journal = _Journal(self.path.with_name(self.path.name + JOURNAL), self._schema)
         self._names: list[str] = []
         self._waiting: list[tuple[npt.NDArray[Any], ...]] = []
         self._count = 0
