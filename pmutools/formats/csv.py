@@ -84,6 +84,8 @@ def _block(
 class CsvRows(TableWriter):
     """Writes each record batch at once, its header before the first."""
 
+    restarts = True  # with another header
+
     def __init__(self, file: OutputFile, schema: Any, options: SinkOptions) -> None:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv

@@ -31,6 +31,8 @@ class TableWriter:
     """Whether names may come dictionary-encoded, by dictionaries that grow."""
     at_once = True
     """Whether what is written can be read after a flush; if not, nothing is gained by small pieces."""
+    restarts = False
+    """Whether a file can go on with other columns."""
     held_bytes = 0
     """What is in memory only."""
 
@@ -179,11 +181,23 @@ class TableSink:
             self._first_name = name
             return self._first_file
         if self._path == STDOUT:
-            raise SourceError("several streams cannot share standard output as tables; name a file, or use --long")
+            return self._same_output(flow, config)
         if self._folder is None:
             self._folder = folder_for(self._path, self._names.suffix)
             self._tables[0].file.move(self._folder / self._first_name)
         return OutputFile(self._folder / name)
+
+    def _same_output(self, flow: Flow, config: StreamConfig) -> OutputFile:
+        """Standard output, where it can go on with what is another table: other columns of the one stream there is."""
+        stream = flow._replace(connection=0), config.idcode
+        if any(key is not None and (key[0], key[1].idcode) != stream for key in self._by_stream):
+            raise SourceError("several streams cannot share standard output as tables; name a file, or use --long")
+        if not self._writer.restarts:
+            raise SourceError(
+                "the columns have changed, and so cannot go on on standard output; name a file, or use --long"
+            )
+        self._tables[-1].flush()
+        return self._tables[-1].file
 
     def _take_away(self) -> None:
         if self._first_file is not None:

@@ -158,7 +158,8 @@ class _Recorder:
         self._window, self._by_arrival = window, by_arrival
         self._tracks: list[Track] = []
         self._places: dict[tuple[Flow, int], int] = {}
-        self._latest: dict[int, int] = {}
+        self._spans: list[tuple[int, int]] = []
+        """When the first and the last frame of each track came, by arrival where that is known."""
         self._editions: dict[tuple[int, StreamConfig], int] = {}
         self._rows: list[Rows] = []
         self._spool = tempfile.SpooledTemporaryFile(max_size=SPOOL_BYTES)  # noqa: SIM115  # lives as long as the reel
@@ -170,11 +171,15 @@ class _Recorder:
         if key not in self._places:
             self._places[key] = len(self._tracks)
             self._tracks.append(Track("", flow, config))
+            self._spans.append((FOREVER, -FOREVER))
         place = self._places[key]
         track = self._tracks[place]
         number = np.arange(track.total, track.total + count, dtype=np.int64)
         track.total += count
         stamps = batch.time_ns
+        came = np.where(batch.arrival_ns == NO_TIME, stamps, batch.arrival_ns)
+        first, last = self._spans[place]
+        self._spans[place] = min(first, int(came.min())), max(last, int(came.max()))
         due = stamps + _latencies(stamps, batch.arrival_ns) if self._by_arrival else stamps
         low, high = self._window.bounds(int(stamps[0]))
         kept = np.flatnonzero((stamps >= low) & (stamps < high))
@@ -201,6 +206,7 @@ class _Recorder:
     def reel(self, select: Collection[str], exclude: Collection[str]) -> Reel:
         if not self._tracks:
             raise SourceError("there are no data frames to play")
+        self._join()
         _name(self._tracks)
         chosen = [place for place in _chosen(self._tracks, select, exclude) if self._tracks[place].frames]
         if not chosen:
@@ -216,12 +222,53 @@ class _Recorder:
         seconds = _round_ns(tracks, rows)
         return Reel(tracks, editions, rows, self._wire(), Fraction(seconds), seconds)
 
+    def _join(self) -> None:
+        """Make one track of what is one stream: a sender that was started again, a configuration that changed.
+
+        Each has a flow of its own then, or a table. They follow one another; two that overlap are two streams.
+        """
+        into, numbers = list(range(len(self._tracks))), [0] * len(self._tracks)
+        ends: dict[tuple[str, int], list[int]] = {}
+        for place in sorted(range(len(self._tracks)), key=lambda place: self._spans[place]):
+            track = self._tracks[place]
+            chains = ends.setdefault((_sender(track), track.config.idcode), [])
+            over = [number for number, end in enumerate(chains) if self._spans[end][1] < self._spans[place][0]]
+            if len(over) != 1:
+                chains.append(place)
+                continue
+            into[place] = into[chains[over[0]]]
+            chains[over[0]] = place
+            whole = self._tracks[into[place]]
+            numbers[place] = whole.total
+            whole.total += track.total
+            if track.frames:
+                whole.frames += track.frames
+                whole.first_ns, whole.last_ns = min(whole.first_ns, track.first_ns), max(whole.last_ns, track.last_ns)
+                whole.first_due_ns = min(whole.first_due_ns, track.first_due_ns)
+        if into == list(range(len(self._tracks))):
+            return
+        kept = sorted(set(into))
+        places = np.array([kept.index(whole) for whole in into], np.int32)
+        shifts = np.array(numbers, np.int64)
+        self._rows = [
+            replace(rows, track=places[rows.track], number=rows.number + shifts[rows.track]) for rows in self._rows
+        ]
+        self._tracks = [self._tracks[whole] for whole in kept]
+
     def _wire(self) -> npt.NDArray[np.uint8]:
         self._spool.seek(0)
         if self._bytes <= SPOOL_BYTES:
             return np.frombuffer(self._spool.read(), np.uint8)
         self._spool.flush()
         return np.memmap(self._spool._file, np.uint8, "r")  # it is a file by now
+
+
+def _sender(track: Track) -> str:
+    """Who sends: a host, whose ports change from one start to the next; in tables, the stations."""
+    flow = track.flow
+    if flow.transport == "file":
+        return "/".join(station.name for station in track.config.stations)
+    return f"{flow.transport}://{flow.source.rpartition(':')[0]}"
 
 
 def _latencies(stamps: I64, arrivals: I64) -> I64:

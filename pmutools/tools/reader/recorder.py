@@ -12,7 +12,7 @@ from pathlib import Path
 from pmutools.c37118.config import StreamConfig
 from pmutools.errors import PmuError, SettingsError, SourceError
 from pmutools.flow import Flow
-from pmutools.formats import Sink, open_sink
+from pmutools.formats import JOURNAL, Sink, open_sink
 from pmutools.formats.columns import Phasors
 from pmutools.formats.fields import Fields
 from pmutools.formats.naming import Namer, safe, stream_name
@@ -85,6 +85,8 @@ def _recorder(recording: Recording, source: LiveSource, tell: Callable[[str], No
     if keep is not None and recording.split is None and not recording.triggers:
         raise SettingsError("--keep counts files of --split or --trigger; add one of them")
     allow_many_files()
+    if not recording.to_stdout and (left := keep_journal(path)) is not None:
+        tell(f"{path} was not finished by the run before: its frames are kept in {left}; pmu convert makes them a file")
     if recording.triggers:
         _try(path, begin)
         watch = Watch(recording.triggers)
@@ -107,6 +109,24 @@ def names_of(source: LiveSource) -> Namer:
         return stream_name(flow, config)
 
     return name
+
+
+def keep_journal(path: Path) -> Path | None:
+    """Give the journal that a killed run has left another name, before a new one takes its place; None without one.
+
+    Raises SourceError where the system refuses.
+    """
+    journal = path.with_name(path.name + JOURNAL)
+    if not journal.is_file():
+        return None
+    number = 1
+    while (kept := path.with_name(f"{path.stem}.left-{number}{path.suffix}{JOURNAL}")).exists():
+        number += 1
+    try:
+        journal.rename(kept)
+    except OSError as error:
+        raise SourceError(f"{journal} holds frames of a killed run and cannot be renamed: {error.strerror}") from None
+    return kept
 
 
 def _try(path: Path, begin: Callable[[Path], Sink]) -> None:

@@ -11,6 +11,7 @@ from pmutools.errors import SourceError
 from pmutools.formats import Sink
 from pmutools.formats.source import Block
 from pmutools.timebase import NS, format_utc
+from pmutools.tools.continuity import Continuity
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.log import Log, Recorder
 from pmutools.tools.reader.reading import Reading
@@ -46,12 +47,14 @@ def read(
     recorder: Recorder = into if hasattr(into, "take") else Log(into)  # type: ignore[assignment]
     clock = source.clock
     due_ns = clock.monotonic_ns() + flush_ns
+    continuity = Continuity()
     with _told(recorder, reading), Threaded() if threaded else Direct() as steps:
-        for found in source.rounds(round_ns):
+        for came in source.rounds(round_ns):
+            found = continuity.settle(came)
             reading.count(found)
             reading.own_drops = source.own_drops
             if observe is not None:
-                observe(found)
+                observe(came)
             steps.do(partial(_record, recorder.take, found), weight(found))
             now_ns = clock.monotonic_ns()
             if now_ns + round_ns // 2 >= due_ns:  # the nearest round, not the next one
