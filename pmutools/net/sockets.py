@@ -13,8 +13,8 @@ from pmutools.errors import SourceError
 from pmutools.flow import StampSource
 from pmutools.net.endpoint import join_host
 
-RCVBUF_BYTES = 16 << 20
-"""Receive buffer asked for: two seconds of 100,000 small datagrams, each charged some 0.8 KiB by the kernel."""
+RCVBUF_BYTES = 64 << 20
+"""Receive buffer asked for: 80,000 small datagrams, each charged some 0.8 KiB by the kernel."""
 
 SNDBUF_BYTES = 8 << 20
 """Send buffer asked for: a tick of some thousand streams, while the network card takes it."""

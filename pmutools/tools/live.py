@@ -26,6 +26,8 @@ POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
 ROUND_NS = 250_000_000
 """How long data frames are gathered before they are handed on, and at most before they are looked at."""
+BACKLOG_NS = 3_000_000_000
+"""What is left in the sockets' buffers in the end is read for so long."""
 ROUND_FRAMES = 1 << 16
 """So many data frames are handed on before their round is over."""
 
@@ -123,11 +125,24 @@ class LiveSource:
                     yield [*out, *gatherer.flush()]
                     out = []
                     now_ns = self.clock.monotonic_ns()
-        self.receivers.soak(0)
-        self._gather(self.receivers.collect(), gatherer, out)
+        for found in self._backlog():
+            self._gather(found, gatherer, out)
+            if gatherer.waiting >= ROUND_FRAMES:
+                yield [*out, *gatherer.flush()]
+                out = []
         self._gather(self.receivers.finish(), gatherer, out)
         self._gather(self.receivers.collect(), gatherer, out)  # the news of the end
         yield [*out, *gatherer.flush()]
+
+    def _backlog(self) -> Iterator[list[Message | Loss | DataRun | LinkEvent]]:
+        """What had arrived when reading ended, and waits in the sockets' buffers: one that is behind has much there."""
+        end_ns, give_up_ns = self.clock.realtime_ns(), self.clock.monotonic_ns() + BACKLOG_NS
+        while True:
+            self.receivers.soak(0)
+            yield (found := self.receivers.collect())
+            runs = [item.train.arrivals_ns[-1] for item in found if isinstance(item, DataRun)]
+            if not runs or max(at or 0 for at in runs) >= end_ns or self.clock.monotonic_ns() >= give_up_ns:
+                return
 
     def _gather(
         self,
