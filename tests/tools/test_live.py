@@ -25,16 +25,15 @@ from pmutools.c37118 import FrameType, Message, StreamConfig, encode_config
 from pmutools.c37118.batch import decode_batch
 from pmutools.c37118.demux import Loss
 from pmutools.clock import VirtualClock
-from pmutools.errors import SettingsError, SourceError
 from pmutools.formats.source import Block
 from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent, LinkKind
-from pmutools.net.endpoint import Endpoint
 from pmutools.net.tcp import TcpCounts
 from pmutools.sites import Site, load_sites
 from pmutools.timebase import NS
 from pmutools.tools import live
-from pmutools.tools.live import LiveSource, saved_configs
+from pmutools.tools.live import LiveSource
+from pmutools.tools.recordings import saved_configs
 
 pytestmark = pytest.mark.realtime
 Item = Block | Message | Loss
@@ -229,26 +228,7 @@ def test_saved_configurations_are_found_whatever_holds_them(tmp_path: Path) -> N
     for suffix in ("c37118", "mcap", "parquet"):
         write(tmp_path / f"saved.{suffix}", recording(stream(7), 3))
         (site,) = ini(tmp_path, "[pmu N1]", "url = udp://127.0.0.1:0", f"config = saved.{suffix}")
-        assert saved_configs([site]) == [stream(7)]
-
-
-def test_what_is_wrong_with_a_saved_configuration_is_told_in_one_line(tmp_path: Path) -> None:
-    write(tmp_path / "one.c37118", recording(stream(7), 3))
-    write(tmp_path / "two.c37118", recording(stream(7, rate=25), 3))
-    url = "url = udp://127.0.0.1:0?source=127.0.0."
-    (lacking,) = ini(tmp_path, "[pmu N1]", url + "1", "idcode = 9", "config = one.c37118")
-    with pytest.raises(SettingsError, match=r"\[pmu N1\] config: .*one.c37118 holds no configuration of IDCODE 9"):
-        LiveSource([lacking])
-    both = ini(tmp_path, "[pmu A]", url + "1", "config = one.c37118", "[pmu B]", url + "2", "config = two.c37118")
-    with pytest.raises(SettingsError, match=r"\[pmu B\].*describes IDCODE 7 in another way than .*one.c37118 of"):
-        LiveSource(both)
-    (absent,) = ini(tmp_path, "[pmu N1]", url + "1", "config = none.c37118")
-    with pytest.raises(SourceError, match=r"none\.c37118"):
-        LiveSource([absent])
-
-
-def test_sites_without_a_configuration_open_no_file() -> None:
-    assert saved_configs([Site("N1", Endpoint(live.parse_endpoint("udp://h:1").scheme, "h", 1))]) == []
+        assert saved_configs([site]) == (stream(7),)
 
 
 # --- the machine
