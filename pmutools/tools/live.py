@@ -26,8 +26,8 @@ POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
 ROUND_NS = 250_000_000
 """How long data frames are gathered before they are handed on, and at most before they are looked at."""
-BACKLOG_NS = 3_000_000_000
-"""What is left in the sockets' buffers in the end is read for so long."""
+BACKLOG_NS = 30_000_000_000
+"""Reading what waits in the sockets in the end takes no longer, whatever its stamps say."""
 ROUND_FRAMES = 1 << 16
 """So many data frames are handed on before their round is over."""
 
@@ -141,7 +141,7 @@ class LiveSource:
             self.receivers.soak(0)
             yield (found := self.receivers.collect())
             runs = [item.train.arrivals_ns[-1] for item in found if isinstance(item, DataRun)]
-            if not runs or max(at or 0 for at in runs) >= end_ns or self.clock.monotonic_ns() >= give_up_ns:
+            if not runs or min(at or 0 for at in runs) >= end_ns or self.clock.monotonic_ns() >= give_up_ns:
                 return
 
     def _gather(
