@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pmutools.tools.characterizer.job import Job, Observe, Outcome, Settings
 
 PROGRESS_NS = NS // 2
-TOLD_REASONS = 3
 
 
 @click.command(name="characterize", short_help="How late, how even, how lossy streams come.")
@@ -190,7 +189,7 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> t
             how = {"view": "delay", "out": asked.out, "wait_ns": settings.wait_ns, "clock": watch}
             stack.enter_context(stage.open(source, f"pmu characterize {asked.name}", name=engine.name, **how))
         job.live(source, lambda: watch.quality, _progress(talk, stage))
-    return job, lambda: "; ".join(dict.fromkeys(map(stage.reasons.why, range(min(len(wanted), TOLD_REASONS)))))
+    return job, lambda: stage.reasons.why_all(len(wanted))
 
 
 def _recorded(asked: Asked, talk: Talk, stop: Callable[[], bool]) -> tuple[Job, Why]:

@@ -147,7 +147,7 @@ def command(
 
         polar: Literal["polar", "rect"] = "rect" if phasors == "rect" else "polar"
         if listing:
-            return list_fields(source, polar, talk, as_json)
+            return list_fields(source, polar, stage, talk, as_json)
         window = Window(ring_ns or RING_NS, after_ns or AFTER_NS)
         recording = Recording(
             cast("str", out), form, polar, long_form, fields, per_stream, split, keep, triggers or (), window
@@ -155,7 +155,7 @@ def command(
         what = f"pmu read {out} ← {ini or ', '.join(urls)}" if live else ""
         reading, recorder = _read(source, recording, talk, stage, what, stack)
         stopped = stop()
-    return report(source, recording, reading, recorder, talk, as_json=as_json, stopped=stopped)
+    return report(source, recording, reading, recorder, stage, talk, as_json=as_json, stopped=stopped)
 
 
 def _endpoints(urls: Sequence[str], ini: str | None) -> list[Any]:

@@ -13,7 +13,9 @@ from pmutools.cli.shell import Exit, Talk
 from pmutools.errors import SourceError
 
 if TYPE_CHECKING:
+    from pmutools.cli.stage import Stage
     from pmutools.tools.live import LiveSource
+    from pmutools.tools.news import Reasons
     from pmutools.tools.reader import Reading
     from pmutools.tools.reader.log import Recorder
     from pmutools.tools.reader.recorder import Recording
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 SHOWN_PATHS = 4
 
 
-def list_fields(source: LiveSource, phasors: Literal["polar", "rect"], talk: Talk, as_json: bool) -> int:
+def list_fields(source: LiveSource, phasors: Literal["polar", "rect"], stage: Stage, talk: Talk, as_json: bool) -> int:
     """Print the columns of all streams once they are known, or at the end."""
     from pmutools.formats.columns import FRAME_COLUMNS
     from pmutools.tools.live import ROUND_NS
@@ -33,7 +35,7 @@ def list_fields(source: LiveSource, phasors: Literal["polar", "rect"], talk: Tal
         if known.settled:
             break
     if not known.configs:
-        raise nothing_came(source)
+        raise nothing_came(source, stage.reasons)
     units = dict.fromkeys(FRAME_COLUMNS, "") | {"time_ns": "ns", "arrival_ns": "ns"}
     units |= {name: column.unit for name, column in known.columns(phasors).items()}
     if as_json:
@@ -50,6 +52,7 @@ def report(
     recording: Recording,
     reading: Reading,
     recorder: Recorder,
+    stage: Stage,
     talk: Talk,
     *,
     as_json: bool,
@@ -66,7 +69,7 @@ def report(
     if stopped:
         return Exit.INTERRUPTED
     if not reading.frames and not reading.skipped:
-        raise nothing_came(source)
+        raise nothing_came(source, stage.reasons)
     return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
 
 
@@ -79,11 +82,8 @@ def _paths_text(paths: Sequence[str]) -> str:
     return f"{len(paths)} files in {', '.join(folders[:SHOWN_PATHS])}{' ...' if len(folders) > SHOWN_PATHS else ''}"
 
 
-def nothing_came(source: LiveSource) -> SourceError:
+def nothing_came(source: LiveSource, reasons: Reasons) -> SourceError:
     """The error of a reader that heard nothing at all."""
     endpoints = [str(endpoint) for endpoint in source.receivers.endpoints]
     named = ", ".join(endpoints[:SHOWN_PATHS]) + (" ..." if len(endpoints) > SHOWN_PATHS else "")
-    return SourceError(
-        f"no data came from {named}; is the sender on, and the port right? "
-        "A device answers to its own IDCODE only: name it with ?idcode=N"
-    )
+    return SourceError(f"no data from {named}: {reasons.why_all(len(endpoints))}")

@@ -9,6 +9,8 @@ USUAL = frozenset((LinkKind.BOUND, LinkKind.CONNECTED, LinkKind.CONFIGURED, Link
 _NO_REASON = frozenset((LinkKind.OWN_DROPS, LinkKind.STREAMING))
 _AFTER_FOREIGN = frozenset((LinkKind.NOTHING, LinkKind.SILENT, LinkKind.UNANSWERED))
 """Follow from frames that are another's."""
+TOLD = 3
+"""Endpoints whose reasons are told together."""
 
 
 def told(event: LinkEvent) -> str:
@@ -36,6 +38,10 @@ class Reasons:
         """Whether the last that was heard is that no connection could be made."""
         event = self._last.get(place)
         return event is not None and event.kind is LinkKind.FAILED
+
+    def why_all(self, places: int) -> str:
+        """The same of the first :data:`TOLD` of so many endpoints, each reason once."""
+        return "; ".join(dict.fromkeys(map(self.why, range(min(places, TOLD)))))
 
     def why(self, place: int = 0) -> str:
         """Why nothing came of an endpoint, as part of a sentence, with what to do."""

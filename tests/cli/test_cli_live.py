@@ -207,7 +207,7 @@ def test_a_reader_that_nothing_came_to_fails_and_says_what_to_look_at(tmp_path: 
     url = f"udp://127.0.0.1:{free_udp_port()}"
     result = run_pmu("read", url, "--out", tmp_path / "x.csv", "--duration", 0.5, "--quiet")
     assert result.code == 1
-    assert result.complaint.startswith(f"pmu: no data came from {url}; is the sender on, and the port right?")
+    assert result.complaint.startswith(f"pmu: no data from {url}: nothing came; is the sender on, and sending to this")
 
 
 def test_bytes_that_are_no_frames_are_exit_code_3(tmp_path: Path) -> None:
