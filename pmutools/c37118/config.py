@@ -151,6 +151,12 @@ class StreamConfig:
     version: int = 1
 
     @property
+    def name(self) -> str:
+        """What the stream is called by itself: as its only station, else ``PDC`` and IDCODE."""
+        lone = self.stations[0].name.strip() if len(self.stations) == 1 else ""
+        return lone or f"PDC{self.idcode}"
+
+    @property
     def rate(self) -> Fraction:
         """Frames per second; 0 where the device left it undefined."""
         return Fraction(self.data_rate) if self.data_rate >= 0 else Fraction(1, -self.data_rate)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.demux import Loss, Message
 from pmutools.cli.herald import Herald
 from pmutools.cli.shell import Talk
@@ -25,7 +26,7 @@ class LiveShow:
     """From ``with`` to its end: give it the news (:meth:`hear`) and the rounds (:meth:`each_round`) of ``source``.
 
     ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own,
-    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` those streams (None: by sites).
+    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` those streams (None: as the source).
     """
 
     def __init__(
@@ -40,11 +41,11 @@ class LiveShow:
         commands: Sequence[Command] = (),
         wait_ns: int = WAIT_NS,
         clock: ClockWatch | None = None,
-        name: Callable[[Flow, int], str | None] | None = None,
+        name: Callable[[Flow, StreamConfig], str | None] | None = None,
     ) -> None:
         self._source, self._more = source, more
         self._out = None if out is None or str(out) == "-" else Path(out)
-        self.watch = Watch(name=name or self._site, wait_ns=wait_ns)
+        self.watch = Watch(name=name or source.name, wait_ns=wait_ns)
         self.screen = WatchScreen(title=title, view=view, commands=commands, herald=Herald(talk))
         self._facts: tuple[str, ...] = ()
         self._facts_due_ns = 0
@@ -77,10 +78,6 @@ class LiveShow:
         if self._out is not None:
             yield f"{self._out.name} {_size(self._out) / 1e6:.1f} MB"
         yield from self._more()
-
-    def _site(self, flow: Flow, idcode: int) -> str | None:
-        site = self._source.site(flow, idcode)
-        return None if site is None else site.name
 
 
 def _size(path: Path) -> int:

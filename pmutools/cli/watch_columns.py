@@ -180,7 +180,7 @@ VIEWS: dict[str, tuple[Shown, ...]] = {
 }
 """What is told of each stream, by view. Rates, percentiles and shares are of the last 10 s, counts since the start."""
 MEANINGS = {
-    "stream": "name in the initialisation file, or that of its station; `PDC` and IDCODE where it has several",
+    "stream": "names in the initialisation file, or that of its station; `PDC` and IDCODE where it has several",
     "id": "IDCODE of the stream",
     "via": "transport",
     "frm/s": "frames that came, a second",

@@ -87,9 +87,7 @@ class LogSink(FrameSink):
 
 
 def _name(config: StreamConfig) -> str:
-    if len(config.stations) == 1 and (name := config.stations[0].name.strip()):
-        return name.replace("/", "_")
-    return f"PDC{config.idcode}"
+    return config.name.replace("/", "_")
 
 
 def create(path: Path, options: SinkOptions) -> LogSink:

@@ -165,10 +165,14 @@ class LiveSource:
                 out.append(item)
         self._take_host_news()
 
-    def site(self, flow: Flow, idcode: int) -> Site | None:
-        """The site that a stream belongs to; None where it was named by its URL only."""
-        owners = self.receivers.owners(flow, idcode)
-        return next((self.sites[index] for index in owners if self.sites[index] is not None), None)
+    def sites_of(self, flow: Flow, idcode: int) -> tuple[Site, ...]:
+        """The sites that are in a stream; none where it was named by its URL only."""
+        found = (self.sites[index] for index in self.receivers.owners(flow, idcode))
+        return tuple(site for site in found if site is not None)
+
+    def name(self, flow: Flow, config: StreamConfig) -> str:
+        """What a stream is called: as its sites, all of them with a ``+`` between, else as its configuration says."""
+        return "+".join(site.name for site in self.sites_of(flow, config.idcode)) or config.name
 
     def tcp_counts(self, index: int) -> TcpCounts:
         """What this machine's kernel has counted so far of the connections of the endpoint at place ``index``."""

@@ -293,10 +293,10 @@ def test_read_live(synthetic: Path, tmp_path: Path) -> None:
                 assert time.monotonic() < end
                 screen.hear(said(master))
             screen.hear(said(master))
-    assert process.returncode == 0
+    assert process.returncode == 0, bytes(screen.raw)[-1500:]
     assert b"\x1b[?25h\x1b[?1049l" in screen.raw
     summary = json.loads((tmp_path / "out").read_bytes())
-    assert summary["streams"] == 8
+    assert len(summary["streams"]) == 8
     assert summary["frames"] > 0
 
 

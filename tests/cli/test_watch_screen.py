@@ -204,7 +204,7 @@ def test_what_there_is_no_stream_for() -> None:
 
 
 def test_what_devices_call_themselves_does_no_harm() -> None:
-    watch = Watch(name=lambda flow, idcode: "\x1b[2J\n[red]x")
+    watch = Watch(name=lambda flow, config: "\x1b[2J\n[red]x")
     watch.add([block(0, range(15))], ROUND_NS)
     screen = [line.plain for line in lines(watch.look(ROUND_NS), Ui(), "t\x1b]0;x\x07", ("\x1b[2J",), 80, 24)]
     assert all(line.isprintable() for line in screen)

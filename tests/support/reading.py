@@ -67,6 +67,9 @@ class Rounds:
     own_drops: int = 0
     tally: Tally = field(default_factory=Tally)
 
+    def name(self, flow: Flow, config: StreamConfig) -> str:
+        return config.name
+
     def rounds(self, round_ns: int = 0) -> Iterator[list[Item]]:
         for found in self.given:
             self.clock.advance(self.round_ns)

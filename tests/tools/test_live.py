@@ -25,6 +25,7 @@ from pmutools.c37118 import FrameType, Message, StreamConfig, encode_config
 from pmutools.c37118.batch import decode_batch
 from pmutools.c37118.demux import Loss
 from pmutools.clock import VirtualClock
+from pmutools.flow import Flow
 from pmutools.formats.source import Block
 from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -33,7 +34,7 @@ from pmutools.sites import Site, load_sites
 from pmutools.timebase import NS
 from pmutools.tools import live
 from pmutools.tools.live import LiveSource
-from pmutools.tools.recordings import saved_configs
+from pmutools.tools.reader.recorder import names_of
 
 pytestmark = pytest.mark.realtime
 Item = Block | Message | Loss
@@ -219,16 +220,21 @@ def test_a_site_s_saved_configuration_serves_a_stream_that_never_sends_one(tmp_p
         items = [item for found in source.rounds() for item in found]
     (block,) = [item for item in items if isinstance(item, Block)]
     assert (len(block.batch), block.batch.config) == (20, config)
-    site = source.site(block.flow, 7)
-    assert site is not None
-    assert site.name == "N1"
+    assert source.name(block.flow, block.batch.config) == "N1"
 
 
-def test_saved_configurations_are_found_whatever_holds_them(tmp_path: Path) -> None:
-    for suffix in ("c37118", "mcap", "parquet"):
-        write(tmp_path / f"saved.{suffix}", recording(stream(7), 3))
-        (site,) = ini(tmp_path, "[pmu N1]", "url = udp://127.0.0.1:0", f"config = saved.{suffix}")
-        assert saved_configs([site]) == (stream(7),)
+def test_a_stream_is_called_by_all_its_sites(tmp_path: Path) -> None:
+    url = "url = udp://127.0.0.1:0?idcode=7"
+    sites = ini(tmp_path, "[pmu NORTH]", url, "station = N1", "[pmu SOUTH]", url, "station = S1")
+    lone = stream(7)
+    pair = replace(lone, stations=(replace(lone.stations[0], name="N1"), replace(lone.stations[0], name="S1")))
+    with LiveSource(sites) as source, LiveSource(["udp://127.0.0.1:0"]) as unnamed:
+        local = source.receivers.local(0)
+        assert local is not None
+        flow = Flow("udp", "127.0.0.1:5000", f"127.0.0.1:{local.port}")
+        assert source.name(flow, pair) == names_of(source)(flow, pair) == "NORTH+SOUTH"
+        assert source.name(flow, replace(pair, idcode=8)) == "PDC8"
+        assert unnamed.name(flow, lone) == lone.stations[0].name.strip()
 
 
 # --- the machine

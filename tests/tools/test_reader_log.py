@@ -209,7 +209,7 @@ def test_an_error_outside_leaves_the_rest_undone() -> None:
 
 
 def test_reading_counts_nothing_twice() -> None:
-    reading = Reading(Rounds([]).tally)
+    reading = Reading(Rounds([]).tally, Rounds([]).name)
     for found in rounds_of(SEVEN, 2):
         reading.count(found)
     assert (reading.frames, len(reading.streams)) == (24, 1)

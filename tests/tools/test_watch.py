@@ -322,7 +322,7 @@ def test_own_drops_and_bytes_that_are_no_frame() -> None:
 
 
 def test_names() -> None:
-    watch = Watch(name=lambda flow, idcode: "SITE" if idcode == 101 else None)
+    watch = Watch(name=lambda flow, config: "SITE" if config.idcode == 101 else None)
     of = config(idcode=7)
     two = StreamMeter(Identity("", 7), of).config
     pdc = type(of)(7, (two.stations[0], two.stations[0]), 60)
@@ -331,8 +331,8 @@ def test_names() -> None:
     joined = replace(made, config=pdc, wire=None, **wide)
     watch.add([block(0, [0]), block(1, [0]), Block(stream(2)[0], joined)], NS)
     told = rows(watch.look(NS))
-    assert list(told) == ["SITE", "N2", "PDC 7"]
-    assert told["PDC 7"].stations == 2
+    assert list(told) == ["SITE", "N2", "PDC7"]
+    assert told["PDC7"].stations == 2
 
 
 # --- bounds ------------------------------------------------------------------------------------------------------

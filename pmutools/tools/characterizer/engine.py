@@ -86,9 +86,9 @@ class Engine:
         """IDCODEs that were configured, by where; None where there was trouble, so that all is news."""
         self._drained = 0
 
-    def name(self, flow: Flow, idcode: int) -> str | None:
+    def name(self, flow: Flow, config: StreamConfig) -> str | None:
         """What a stream is called; None for one that is not measured yet."""
-        gauge = self._by_flow.get(flow, {}).get(idcode)
+        gauge = self._by_flow.get(flow, {}).get(config.idcode)
         return None if gauge is None else gauge.name
 
     # --- what comes

@@ -39,12 +39,11 @@ def key_of(flow: Flow, idcode: int, owners: tuple[int, ...]) -> Hashable:
 def identity_of(
     flow: Flow, config: StreamConfig, owners: tuple[int, ...], wanted: Sequence[Wanted], taken: Iterable[str]
 ) -> Identity:
-    """What a new stream is called: as its sites, as its only station, or by its IDCODE; not as those ``taken``."""
+    """What a new stream is called: as its sites, or by its configuration; not as those ``taken``."""
     mine = [wanted[place] for place in owners]
     sites = [site for each in mine for site in each.sites]
     stations = [station.name for station in config.stations]
-    lone = stations[0] if len(stations) == 1 and stations[0] else str(config.idcode)
-    (name,) = unique(("+".join(sites) or lone,), taken)
+    (name,) = unique(("+".join(sites) or config.name,), taken)
     others = tuple(dict.fromkeys(other for other in (*sites, *stations, str(config.idcode)) if other != name))
     where = str(mine[0].endpoint) if mine else " > ".join(filter(None, (flow.source, flow.destination)))
     rate = next((each.rate for each in mine if each.rate), None)

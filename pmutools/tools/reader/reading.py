@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message, Tally
 from pmutools.flow import Flow
@@ -46,6 +47,8 @@ class Reading:
     """What was read so far."""
 
     tally: Tally
+    name: Callable[[Flow, StreamConfig], str]
+    """What a stream is called."""
     frames: int = 0
     kept: int = 0
     """Of these, frames that are in the recording whatever happens now."""
@@ -86,8 +89,7 @@ class Reading:
         stream = self.streams.get(key)
         first_ns, last_ns = int(batch.time_ns.min()), int(batch.time_ns.max())
         if stream is None:
-            stations = batch.config.stations
-            name = stations[0].name.strip() if len(stations) == 1 else f"PDC{batch.config.idcode}"
+            name = self.name(flow, batch.config)
             place = f"{flow.transport} {flow.source}" + (f" > {flow.destination}" if flow.destination else "")
             stream = self.streams[key] = StreamReading(name, place, batch.config.idcode, 0, first_ns, last_ns)
         stream.frames += len(batch)

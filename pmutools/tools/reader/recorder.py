@@ -97,16 +97,10 @@ def _recorder(recording: Recording, source: LiveSource, tell: Callable[[str], No
 
 
 def names_of(source: LiveSource) -> Namer:
-    """Names of files: that of the site in the initialisation file which a stream belongs to, else of the stream."""
+    """Names of files: those of the sites that are in a stream, else station and IDCODE."""
 
     def name(flow: Flow, config: StreamConfig) -> str:
-        owners = source.receivers.owners(flow, config.idcode)
-        sites = {site for index in owners if (site := source.sites[index]) is not None}
-        if len(sites) == 1:
-            (site,) = sites
-            if site.station is None or len(config.stations) == 1:
-                return safe(site.name)
-        return stream_name(flow, config)
+        return safe(source.name(flow, config)) if source.sites_of(flow, config.idcode) else stream_name(flow, config)
 
     return name
 

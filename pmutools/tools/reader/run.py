@@ -43,7 +43,7 @@ def read(
     SourceError
         The system refuses to write. What was flushed is kept, the message says how much that is; ``into`` is closed.
     """
-    reading = Reading(source.tally)
+    reading = Reading(source.tally, source.name)
     recorder: Recorder = into if hasattr(into, "take") else Log(into)  # type: ignore[assignment]
     clock = source.clock
     due_ns = clock.monotonic_ns() + flush_ns

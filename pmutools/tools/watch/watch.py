@@ -47,14 +47,14 @@ Key = tuple[str, str, str, int | None]
 class Watch:
     """See the package. Times ``now_ns`` are monotonic, the same clock throughout.
 
-    ``name`` gives a stream's name, where it has one other than its station's. ``wait_ns`` is the concentrator's: what
-    comes later is late.
+    ``name`` gives a stream's name, where it has one other than by its configuration. ``wait_ns`` is the
+    concentrator's: what comes later is late.
     """
 
     def __init__(
         self,
         *,
-        name: Callable[[Flow, int], str | None] = lambda flow, idcode: None,
+        name: Callable[[Flow, StreamConfig], str | None] = lambda flow, config: None,
         wait_ns: int = WAIT_NS,
         streams: int = STREAMS,
     ) -> None:
@@ -217,9 +217,7 @@ class Watch:
         before, self._configs[row] = self._configs[row], config
         if before == config:
             return
-        one = len(config.stations) == 1
-        station = config.stations[0].name.strip() if one else f"PDC {config.idcode}"
-        self._names[row] = self._name(flow, config.idcode) or station or f"IDCODE {config.idcode}"
+        self._names[row] = self._name(flow, config) or config.name
         if before is None or before.rate != config.rate:
             self._slots.restart(row, self._live.set_rate(row, config.rate))
 
