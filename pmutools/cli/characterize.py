@@ -186,7 +186,14 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> t
         job = Job(engine, Folder(asked.out), settings, source.clock, source=asked.name)
         watch = stack.enter_context(ClockWatch())
         if asked.shown:
-            how = {"view": "delay", "out": asked.out, "wait_ns": settings.wait_ns, "clock": watch}
+            paths = [asked.out / name for name in FILES]
+            how = {
+                "view": "delay",
+                "out": asked.out,
+                "paths": lambda: paths,
+                "wait_ns": settings.wait_ns,
+                "clock": watch,
+            }
             stack.enter_context(stage.open(source, f"pmu characterize {asked.name}", name=engine.name, **how))
         job.live(source, lambda: watch.quality, _progress(talk, stage))
     return job, lambda: stage.reasons.why_all(len(wanted))

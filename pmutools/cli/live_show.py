@@ -25,8 +25,9 @@ from pmutools.tools.watch import Watch
 class LiveShow:
     """From ``with`` to its end: give it the news (:meth:`hear`) and the rounds (:meth:`each_round`) of ``source``.
 
-    ``out`` is what is written, a file or a folder: its size is told. ``more`` gives facts of the command's own,
-    ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` those streams (None: as the source).
+    ``out`` names what is written, ``paths`` gives its files, whose size is told. ``more`` gives facts of the command's
+    own, ``clock`` looks after this machine's clock (None: a watch of its own), ``name`` names those streams (None: as
+    the source does).
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class LiveShow:
         talk: Talk,
         view: str = "frequency",
         out: str | Path | None = None,
+        paths: Callable[[], Sequence[Path]] = tuple,
         more: Callable[[], Sequence[str]] = tuple,
         commands: Sequence[Command] = (),
         wait_ns: int = WAIT_NS,
@@ -44,6 +46,7 @@ class LiveShow:
         name: Callable[[Flow, StreamConfig], str | None] | None = None,
     ) -> None:
         self._source, self._more = source, more
+        self._paths = paths
         self._out = None if out is None or str(out) == "-" else Path(out)
         self.watch = Watch(name=name or source.name, wait_ns=wait_ns)
         self.screen = WatchScreen(title=title, view=view, commands=commands, herald=Herald(talk))
@@ -76,15 +79,12 @@ class LiveShow:
         if self._clock is not None:
             yield self._clock.quality.short
         if self._out is not None:
-            yield f"{self._out.name} {_size(self._out) / 1e6:.1f} MB"
+            yield f"{self._out.name} {sum(map(_size, self._paths())) / 1e6:.1f} MB"
         yield from self._more()
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, or of the files side by side in the folder that is named as it."""
     try:
-        if path.is_file():
-            return path.stat().st_size
-        return sum(file.stat().st_size for file in path.with_suffix("").iterdir())
-    except OSError:
+        return path.stat().st_size
+    except OSError:  # not there yet, or not any more
         return 0

@@ -192,7 +192,9 @@ def _read(
     soon = recording.to_stdout or isinstance(recorder, Ring)
 
     if shown:
-        stack.enter_context(stage.open(source, shown, out=recording.out, commands=_commands(recorder)))
+        stack.enter_context(
+            stage.open(source, shown, out=recording.out, paths=lambda: recorder.paths, commands=_commands(recorder))
+        )
 
     def observe(found: Any) -> None:
         stage.look(found, source.clock.monotonic_ns())

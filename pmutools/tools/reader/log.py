@@ -24,7 +24,7 @@ class Recorder(Protocol):
 
     @property
     def paths(self) -> list[Path]:
-        """The files written so far."""
+        """The files written so far; may be asked by another thread."""
 
     def take(self, found: Round) -> None:
         """Record a round."""

@@ -78,7 +78,8 @@ class Ring:
 
     @property
     def paths(self) -> list[Path]:
-        return self._files.paths + (self._event.log.paths if self._event is not None else [])
+        event = self._event  # which the thread that records may end meanwhile
+        return self._files.paths + (event.log.paths if event is not None else [])
 
     @property
     def idle(self) -> tuple[str, ...]:

@@ -49,7 +49,7 @@ class Files:
 
     @property
     def paths(self) -> list[Path]:
-        return [path for recording in self._recordings for path in recording]
+        return [path for recording in list(self._recordings) for path in recording]
 
     def add(self, paths: list[Path]) -> None:
         """A recording is finished."""
