@@ -16,6 +16,7 @@ from support.live import CLOCK, data_frame, stream
 from pmutools import linux
 from pmutools.c37118 import Command, StreamConfig, encode_command, encode_config, encode_header
 from pmutools.c37118.demux import DataRun, Loss, Message, Tally
+from pmutools.clock import SystemClock
 from pmutools.flow import Flow, StampSource
 from pmutools.net import sorting
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -94,6 +95,13 @@ def in_bulk(outcome: Outcome, until: int) -> None:
             outcome.add(item)
 
 
+class FrozenClock(SystemClock):
+    """No timer runs out: what both ways tell depends on what came alone, not on how long it took."""
+
+    def monotonic_ns(self) -> int:
+        return 0
+
+
 @contextmanager
 def both(*queries: str) -> Iterator[tuple[Outcome, Outcome]]:
     """Two front ends on ports of their own, with the same endpoints but for the port."""
@@ -104,7 +112,7 @@ def both(*queries: str) -> Iterator[tuple[Outcome, Outcome]]:
                 probe.bind(("0.0.0.0", 0))
                 port = probe.getsockname()[1]
             endpoints = [parse_endpoint(f"udp://0.0.0.0:{port}{query}") for query in queries]
-            outcomes.append(Outcome(stack.enter_context(Receivers(endpoints, CLOCK))))
+            outcomes.append(Outcome(stack.enter_context(Receivers(endpoints, FrozenClock()))))
         one_by_one(outcomes[0], 0)
         outcomes[1].receivers.soak(0)  # from here on in bulk
         yield outcomes[0], outcomes[1]
