@@ -18,6 +18,11 @@ class StampSource(StrEnum):
     CAPTURE = "capture"
 
 
+def host_of(address: str) -> str:
+    """``host`` of ``host:port`` or ``[host]:port``; all of it where there is no port."""
+    return address.rpartition(":")[0].strip("[]") or address
+
+
 class Flow(NamedTuple):
     """One direction of one conversation. ``transport`` is ``udp``, ``tcp`` or ``file``.
 
@@ -29,6 +34,16 @@ class Flow(NamedTuple):
     source: str
     destination: str = ""
     connection: int = 0
+
+    @property
+    def ends(self) -> Flow:
+        """All connections between the same two endpoints, as one."""
+        return self if not self.connection else self._replace(connection=0)
+
+    @property
+    def host(self) -> str:
+        """The source without its port, IPv6 without brackets; a file's name as it is."""
+        return host_of(self.source)
 
     @property
     def is_stream(self) -> bool:

@@ -21,7 +21,7 @@ from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
 from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason
 from pmutools.c37118.prefix import decode_prefix
 from pmutools.errors import WireError
-from pmutools.flow import Chunk, Flow, Train
+from pmutools.flow import Chunk, Flow, Train, host_of
 
 HELD_BYTES = 4 << 20
 ALL_HELD_BYTES = 64 << 20
@@ -88,10 +88,6 @@ _Place = tuple[str, int]
 """A host and an IDCODE."""
 
 
-def _host(endpoint: str) -> str:
-    return endpoint.rpartition(":")[0] or endpoint
-
-
 def _forget(table: dict[_Place, dict[Flow, _T]], place: _Place, flow: Flow) -> None:
     """Take ``flow`` out, and with the last flow the place, so that a table is no larger than the flows there are."""
     flows = table.get(place, {})
@@ -109,7 +105,7 @@ class _Held:
 class _FlowState:
     def __init__(self, flow: Flow) -> None:
         self.flow = flow
-        self.host = _host(flow.source)
+        self.host = flow.host
         self.framer = Framer(streaming=flow.is_stream)
         self.configs: dict[int, StreamConfig] = {}
         self.fitting: dict[bytes, StreamConfig] = {}
@@ -347,7 +343,7 @@ class Demux:
     def _context(self, flow: Flow, frame: Frame) -> StreamConfig | None:
         """The configuration of the stream that a header comes from or a command goes to, for its TIME_BASE."""
         end = flow.destination if frame.type is FrameType.COMMAND else flow.source
-        known = self._configs.get((_host(end), frame.idcode), {})
+        known = self._configs.get((host_of(end), frame.idcode), {})
         return next(iter(known.values()), None)
 
     def _emit(self, message: Message, kind: FrameType, out: list[Message | Loss]) -> None:

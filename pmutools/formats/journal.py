@@ -63,7 +63,7 @@ class Journal:
 
     def add(self, block: Block) -> None:
         flow, batch = block
-        key = flow._replace(connection=0), batch.config.idcode
+        key = flow.ends, batch.config.idcode
         if self._shown.get(key) != (flow, batch.config):
             self._shown[key] = flow, batch.config
             arrival = batch.arrival_ns[:1].astype("<i8").tobytes()

@@ -63,7 +63,7 @@ class LogSink(FrameSink):
         frame, flow, config = message
         if config is None or not (frame.type is FrameType.DATA or frame.type.is_config):
             return
-        key = (flow._replace(connection=0), config.idcode)
+        key = (flow.ends, config.idcode)
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = unique([_name(config)], self._names.values())[0]

@@ -36,7 +36,7 @@ class PerStreamSink(FrameSink):
         self._closed = False
 
     def put(self, message: Message) -> None:
-        key = message.flow._replace(connection=0), message.frame.idcode
+        key = message.flow.ends, message.frame.idcode
         sink = self._sinks.get(key)
         if sink is None:
             early = self._early.setdefault(key, [])

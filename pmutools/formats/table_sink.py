@@ -123,7 +123,7 @@ class TableSink:
         options = self._options
         if options.fields is not None and not has_columns(batch.config, options.phasors, options.fields):
             return
-        key = None if options.long else (flow._replace(connection=0), batch.config)
+        key = None if options.long else (flow.ends, batch.config)
         table = self._by_stream.get(key)
         if table is None:
             table = self._by_stream[key] = self._begin(flow, batch.config)

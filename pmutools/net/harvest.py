@@ -173,7 +173,7 @@ class _Touched:
             return True
         if not self.configured or not _takes_others(candidate, demux):
             return False
-        host = _host(flow)
+        host = flow.host
         return (host, idcode) in self.configured or (host, None) in self.configured
 
 
@@ -181,10 +181,10 @@ def _touched(chunks: Sequence[Chunk], candidates: Sequence[Candidate], demux: De
     """Which streams the frames in ``chunks`` belong to, as far as candidates need to know."""
     touched = _Touched()
     flows = {each.flow for each in candidates}
-    hosts = {_host(each.flow) for each in candidates if _takes_others(each, demux)}
+    hosts = {each.flow.host for each in candidates if _takes_others(each, demux)}
     framer = Framer(streaming=False)
     for chunk in chunks:
-        flow, host = chunk.flow, _host(chunk.flow)
+        flow, host = chunk.flow, chunk.flow.host
         if flow.is_stream:
             touched.connections.add(flow)
             touched.configured.add((host, None))
@@ -200,7 +200,3 @@ def _touched(chunks: Sequence[Chunk], candidates: Sequence[Candidate], demux: De
 def _takes_others(candidate: Candidate, demux: Demux) -> bool:
     """Whether its frames may be read by a configuration that another flow shows."""
     return candidate.config is None or demux.is_borrowed(candidate.flow, candidate.idcode)
-
-
-def _host(flow: Flow) -> str:
-    return flow.source.rpartition(":")[0]

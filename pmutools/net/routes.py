@@ -174,7 +174,7 @@ class Routes:
         listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
         if listener is None:  # a connection that has ended meanwhile
             return None
-        host = flow.source.rpartition(":")[0].strip("[]")
+        host = flow.host
         owners = tuple(
             index
             for wanted in (idcode, None)

@@ -168,7 +168,7 @@ class Surveyor:
         self.reasons.hear(event)
         if event.flow is None or event.idcode is None or not event.owners:
             return
-        host, place = _host(event.flow), event.owners[0]
+        host, place = event.flow.host, event.owners[0]
         if event.kind is LinkKind.CONFIGURED and len(self._places) < STREAMS:
             self._places[event.flow, event.idcode] = place
         if event.kind is LinkKind.NO_CONFIG and len(self._unconfigured) < STREAMS:
@@ -192,7 +192,7 @@ class Surveyor:
         if place is None:
             return
         endpoint = self.endpoints[place].endpoint
-        host = endpoint.host if endpoint.scheme.commanded else _host(item.flow)  # whose data may come from elsewhere
+        host = endpoint.host if endpoint.scheme.commanded else item.flow.host  # whose data may come from elsewhere
         key = (place, host, config.idcode)
         stream = self._streams.get(key)
         if stream is None:
@@ -202,7 +202,7 @@ class Surveyor:
                 return
             stream = self._streams[key] = SurveyedStream(host, StreamInventory(item.flow, config.idcode, config))
             self.endpoints[place].streams.append(stream)
-        self._unconfigured.pop((place, _host(item.flow), config.idcode), None)
+        self._unconfigured.pop((place, item.flow.host, config.idcode), None)
         if isinstance(item, Block):
             stream.add(item.batch, now_ns)
             if len(stream.senders) < SENDERS:
@@ -238,11 +238,6 @@ def _looked_at(streams: Sequence[SurveyedStream], now_ns: int) -> bool:
     return bool(streams) and all(
         stream.since_ns is not None and now_ns - stream.since_ns >= LOOK_NS for stream in streams
     )
-
-
-def _host(flow: Flow) -> str:
-    """Where a flow comes from, without the port."""
-    return flow.source.rpartition(":")[0].strip("[]")
 
 
 def survey(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Sequence
 
 from pmutools.c37118.config import StreamConfig
-from pmutools.flow import Flow
+from pmutools.flow import Flow, host_of
 from pmutools.measure.stream import Identity
 from pmutools.net.endpoint import Scheme, is_multicast
 from pmutools.parsers import unique
@@ -32,8 +32,8 @@ def key_of(flow: Flow, idcode: int, owners: tuple[int, ...]) -> Hashable:
     if flow.transport == "udp":
         return "udp", flow.destination, idcode
     if flow.transport == "tcp":
-        return "tcp", flow.source, flow.destination.rpartition(":")[0], idcode
-    return flow._replace(connection=0), idcode
+        return "tcp", flow.source, host_of(flow.destination), idcode
+    return flow.ends, idcode
 
 
 def identity_of(
@@ -61,5 +61,5 @@ def silent_identity(wanted: Wanted, taken: Iterable[str]) -> Identity:
 
 
 def _to_group(flow: Flow) -> bool:
-    host = flow.destination.rpartition(":")[0].strip("[]")
+    host = host_of(flow.destination)
     return flow.transport == "udp" and bool(host) and is_multicast(host)

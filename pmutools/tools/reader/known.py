@@ -39,7 +39,7 @@ class Known:
             if not isinstance(item, Block):
                 continue
             flow, config = item.flow, item.batch.config
-            key = flow._replace(connection=0), config.idcode
+            key = flow.ends, config.idcode
             if self.configs.get(key) != config:
                 self.configs[key] = config
                 self._owners.update(receivers.owners(flow, config.idcode))

@@ -85,7 +85,7 @@ class Reading:
 
     def _count_block(self, block: Block) -> None:
         flow, batch = block
-        key = flow._replace(connection=0), batch.config.idcode
+        key = flow.ends, batch.config.idcode
         stream = self.streams.get(key)
         first_ns, last_ns = int(batch.time_ns.min()), int(batch.time_ns.max())
         if stream is None:

@@ -91,7 +91,7 @@ class Watch:
 
     def _block(self, block: Block, now_ns: int) -> Iterator[Fired]:
         flow, batch = block
-        key = flow._replace(connection=0), batch.config.idcode
+        key = flow.ends, batch.config.idcode
         stream = self._streams.get(key)
         if stream is None or stream.config != batch.config:
             stream = self._streams[key] = _Stream(batch.config)

@@ -82,7 +82,7 @@ def concentrated(
 
 def _stream_of(block: Block) -> Stream:
     """Connections between the same two endpoints are one stream."""
-    return block.flow._replace(connection=0), block.batch.config.idcode
+    return block.flow.ends, block.batch.config.idcode
 
 
 def _with_config(flow: Flow, batches: Iterable[Batch], shown: dict[Stream, StreamConfig]) -> Iterator[Item]:
@@ -99,7 +99,7 @@ def _survey(items: Iterable[Item]) -> dict[Stream, _Seen]:
     found: dict[Stream, _Seen] = {}
     for item in gather(items):
         if isinstance(item, Message) and item.frame.type.rules_data:
-            order.setdefault((item.flow._replace(connection=0), item.frame.idcode))
+            order.setdefault((item.flow.ends, item.frame.idcode))
         elif isinstance(item, Block) and len(item.batch):
             key = _stream_of(item)
             order.setdefault(key)

@@ -298,7 +298,7 @@ class Watch:
 
 def _key(flow: Flow, idcode: int | None) -> Key:
     """A device that connects again, or sends from another port, goes on in its row."""
-    source = flow.source.rpartition(":")[0] if flow.transport == "udp" else flow.source
+    source = flow.host if flow.transport == "udp" else flow.source
     return flow.transport, source, flow.destination if flow.transport == "udp" else "", idcode
 
 
