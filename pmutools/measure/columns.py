@@ -117,6 +117,12 @@ _FRAMES = tuple(item.name for item in fields(Frames))
 _UNLOCKED = 0x0030
 
 
+def are_synchronised(time_quality: npt.NDArray[np.uint8], stat: npt.NDArray[np.uint16]) -> Flags:
+    """(N,) MSG_TQ says locked, and STAT (N,) neither not synchronised nor unlocked for 10 s or longer."""
+    found: Flags = (time_quality & 0xF == 0) & (stat & np.uint16(Stat.NOT_SYNCHRONISED | _UNLOCKED) == 0)
+    return found
+
+
 def frames_of(gist: Gist, rate: Fraction, counted: int = 0) -> Frames:
     """What the meters look at of a gist.
 
@@ -132,7 +138,7 @@ def frames_of(gist: Gist, rate: Fraction, counted: int = 0) -> Frames:
     if (unknown := gist.arrival_ns == NO_TIME).any():
         delay[unknown] = NO_TIME
     stat = any_station(gist.stat)
-    synchronised = (gist.time_quality & 0xF == 0) & (stat & np.uint16(Stat.NOT_SYNCHRONISED | _UNLOCKED) == 0)
+    synchronised = are_synchronised(gist.time_quality, stat)
     return Frames(
         slot, off_grid, gist.time_ns, gist.arrival_ns, delay, synchronised, gist.stamp_source, stat, gist.mark
     )

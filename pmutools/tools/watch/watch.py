@@ -10,13 +10,15 @@ import numpy.typing as npt
 
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, Stat
+from pmutools.c37118.constants import STAT_DATA_ERROR_MASK
 from pmutools.c37118.demux import Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats.source import Block
+from pmutools.measure.columns import are_synchronised
 from pmutools.measure.stream import WAIT_NS
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.timebase import NS
+from pmutools.tools.news import told
 from pmutools.tools.watch.live import HIDDEN, Frames, Live, Round
 from pmutools.tools.watch.recent import RECENT_NS, Recent, shares
 from pmutools.tools.watch.slots import SlotTable
@@ -27,8 +29,7 @@ STREAMS = 1 << 14
 """Streams kept, some 8 KB each; frames of more are counted as ``untold``."""
 FOREIGN = 64
 """Senders that nobody asked for, of those."""
-_UNLOCKED = 0x0030
-_BAD = np.uint16(STAT_DATA_ERROR_MASK | Stat.NOT_SYNCHRONISED | _UNLOCKED)
+_DATA_ERROR = np.uint16(STAT_DATA_ERROR_MASK)
 _STATE_OF = {
     LinkKind.LOST: StreamState.LOST,
     LinkKind.FAILED: StreamState.FAILED,
@@ -114,7 +115,7 @@ class Watch:
             if state is not None and not (state is StreamState.WAITING and self._live.last_ns[row] != NO_TIME):
                 self._live.state[row] = STATES.index(state)
             if event.kind is not LinkKind.STREAMING:  # that is its state
-                self._news[row] = f"{event.kind}: {event.detail}" if event.detail else str(event.kind)
+                self._news[row] = told(event)
                 self._live.news_ns[row] = now_ns
         if event.kind in _SETTLED:
             for owner in event.owners:
@@ -262,7 +263,7 @@ class Watch:
         timed: Flags = first & known
         late = segments.sums(timed & (delay_ns > self.wait_ns))
         self._live.late[rows] += late
-        locked = (frames.stat & _BAD == 0) & (frames.time_quality & 0xF == 0)
+        locked = are_synchronised(frames.time_quality, frames.stat) & (frames.stat & _DATA_ERROR == 0)
         counts = {
             "frames": segments.lengths,
             "good": segments.sums(locked & frames.valid & ~np.isnan(frames.frequency_hz)),
