@@ -14,7 +14,6 @@ from pmutools.cli.read_report import list_fields, report
 from pmutools.cli.shell import Parsed, Talk, common, interruptible
 from pmutools.cli.sources import DURATION
 from pmutools.errors import SettingsError
-from pmutools.timebase import NS
 
 if TYPE_CHECKING:
     from pmutools.cli.stage import Stage
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 FORMS = ("csv", "jsonl", "arrow", "raw", "pcapng", "pcap")
 MANY_TABLES = 64
 """Tables side by side, above which one in long form is recommended."""
-RING_NS, AFTER_NS = 60 * NS, 10 * NS
 
 
 def _fields(text: str) -> Any:
@@ -143,12 +141,12 @@ def command(
             LiveSource(_endpoints(urls, ini), duration_ns=duration_ns, tell=stage.hear, stop=stage.over)
         )
         from pmutools.tools.reader.recorder import Recording  # slow to import: the sockets are bound by now
-        from pmutools.tools.reader.ring import Window
+        from pmutools.tools.reader.ring import WINDOW, Window
 
         polar: Literal["polar", "rect"] = "rect" if phasors == "rect" else "polar"
         if listing:
             return list_fields(source, polar, stage, talk, as_json)
-        window = Window(ring_ns or RING_NS, after_ns or AFTER_NS)
+        window = Window(ring_ns or WINDOW.before_ns, after_ns or WINDOW.after_ns)
         recording = Recording(
             cast("str", out), form, polar, long_form, fields, per_stream, split, keep, triggers or (), window
         )

@@ -152,9 +152,7 @@ VIEWS: dict[str, tuple[Shown, ...]] = {
         Shown(_P50.column._replace(from_width=100), "p50_ms"),
         _P99,
         Shown(Column("STAT", 16, _of("stat", lambda stat: stat_text(int(stat))), from_width=130, left=True), "stat"),
-        Shown(
-            Column("time", 8, _of("time_quality", lambda q: time_quality_text(int(q))), 130, left=True), "time_quality"
-        ),
+        Shown(Column("time", 8, _of("time_quality", _quality), 130, left=True), "time_quality"),
         Shown(Column("Hz", 8, _of("frequency_hz", hertz)), "frequency_hz"),
         Shown(Column("last 15 s", 0, lambda row: sparkline(row.frequencies_hz, 60, FREQUENCY_SPAN_HZ), tail=True)),
     ),

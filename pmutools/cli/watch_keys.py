@@ -122,13 +122,7 @@ KEYS = (
     Key(("END", "G"), "END G", "", "The last stream.", _select(lambda ui, around: around.streams - 1)),
     Key(("v", "TAB"), "v TAB", "v view", "The other view: frequency, or delay.", _view),
     Key(("s",), "s", "s sort", "Sort by the next column.", _sort),
-    Key(
-        ("r",),
-        "r",
-        "",
-        "Sort the other way.",
-        lambda ui, around: Step(replace(ui, backwards=not ui.backwards)),
-    ),
+    Key(("r",), "r", "", "Sort the other way.", _reverse),
     Key(("w",), "w", "w worst", "Worst first: what does not stream, then loss, quality, p99.", _worst),
     Key(
         ("/",),

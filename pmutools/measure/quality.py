@@ -220,12 +220,10 @@ class Events(Counts):
     """Frames whose CHK is wrong: lost frames too (RFC 7680)."""
     bad_size: int = 0
     """Frames whose FRAMESIZE does not fit their configuration."""
-    unknown_idcode: int = 0
-    """Data frames of an IDCODE without a configuration."""
     skipped_bytes: int = 0
     """Bytes that are part of no frame."""
     before_config: int = 0
-    """Data frames that came before a configuration."""
+    """Data frames whose IDCODE had no configuration that fits, or none yet."""
     own_drops: int = 0
     """Datagrams that this host's socket buffer had no room for: no loss of the network's."""
     connects: int = 0

@@ -70,15 +70,6 @@ def group(rows: Rows) -> Groups:
     return Groups(order, starts, kinds[firsts, 0], mixed)
 
 
-class Found(NamedTuple):
-    """What the frames of a group show."""
-
-    good: bool
-    """Every CHK holds, and one source has stamped them all."""
-    announcing: int
-    """Frames in which STAT bit 10 of any station announces a change of the configuration."""
-
-
 def octets_by_size(rows: Rows, groups: Groups) -> list[tuple[int, int, NDArray[np.uint8]]]:
     """For each FRAMESIZE (first group, last group exclusive, octets (K, FRAMESIZE) of their rows in order)."""
     sizes = groups.sizes

@@ -18,11 +18,6 @@ Extra = Callable[[], Mapping[str, Any]]
 """What is known of the input beside the streams: bytes by what became of them, defects."""
 
 
-def nothing_more() -> Mapping[str, Any]:
-    """Nothing is known beside the streams."""
-    return {}
-
-
 def run_part(
     engine: Engine, source: str, begin_ns: int | None, end_ns: int, extra: Extra, *, complete: bool
 ) -> dict[str, Any]:

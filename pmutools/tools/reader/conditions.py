@@ -125,17 +125,7 @@ def parse_condition(text: str) -> Condition:
     for form, make in _FORMS:
         if match := form.fullmatch(text):
             return make(text, match)
-    known = [
-        "signal",
-        "key",
-        *(f"stat:{flag}" for flag in FLAGS),
-        "freq<59.95",
-        "rocof>1",
-        "mag<1",
-        "loss",
-        "silence>2s",
-    ]
-    raise ValueError(f"{text!r} is no trigger; {suggestion(text, known)}")
+    raise ValueError(f"{text!r} is no trigger; {suggestion(text, EXAMPLES)}")
 
 
 def _flag(text: str, match: re.Match[str]) -> Condition:

@@ -81,9 +81,6 @@ class Row(NamedTuple):
     """(P,) the largest of each."""
 
 
-TEXTS = ("name", "transport", "where", "news")
-
-
 @dataclass(frozen=True)
 class Snapshot:
     """All streams, a column a field of :class:`Row`; and what is of all of them together."""
