@@ -97,7 +97,7 @@ def _leap(scene: Scene) -> str | None:
 
 
 def _smear(scene: Scene) -> str | None:
-    skew, flagged = scene.result.course.skew(), scene.result.counts.quality.leap_flagged
+    skew, flagged = scene.result.floor.skew(), scene.result.counts.quality.leap_flagged
     if skew is None or not flagged or not 0.7 * SMEAR_PPM < abs(skew.ppm) < 1.4 * SMEAR_PPM:
         return None
     return (
@@ -107,7 +107,7 @@ def _smear(scene: Scene) -> str | None:
 
 
 def _trend(scene: Scene) -> tuple[Skew, Step] | None:
-    skew, step = scene.result.course.skew(), scene.result.course.step()
+    skew, step = scene.result.floor.skew(), scene.result.floor.step()
     return None if skew is None or step is None else (skew, step)
 
 

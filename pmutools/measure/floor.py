@@ -44,7 +44,7 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class FloorCourse:
     """The least delay (P,) of each stretch of time that begins at (P,)."""
 
     start_ns: Ints
@@ -126,13 +126,13 @@ class FloorMeter:
                 _append(merged, bucket - bucket % self._width, least)
             self._course = merged
 
-    def course(self) -> Course:
+    def course(self) -> FloorCourse:
         """The floor so far."""
         points = list(self._course)
         if self._bucket is not None and self._least != _NEVER:
             _append(points, self._bucket - self._bucket % self._width, self._least)
         table = np.array(points, np.int64).reshape(-1, 2)
-        return Course(table[:, 0] * BUCKET_NS, table[:, 1])
+        return FloorCourse(table[:, 0] * BUCKET_NS, table[:, 1])
 
 
 def _append(course: list[tuple[int, int]], bucket: int, least: int) -> None:

@@ -18,7 +18,7 @@ from pmutools.measure.columns import Frames, Gist, Ints, frames_of, gathered, gi
 from pmutools.measure.counts import Counts
 from pmutools.measure.delay import DelayCounts, DelayMeter
 from pmutools.measure.evenness import RateCounts, RateMeter
-from pmutools.measure.floor import Course
+from pmutools.measure.floor import FloorCourse
 from pmutools.measure.hours import HourCounts
 from pmutools.measure.quality import Events, QualityCounts, QualityMeter
 from pmutools.measure.sequence import LossCounts, OrderCounts
@@ -90,7 +90,7 @@ class StreamResult:
     first_arrival_ns: int | None
     last_arrival_ns: int | None
     silences: tuple[Silence, ...]
-    course: Course
+    floor: FloorCourse
     end_ns: int | None = None
     """When the measurement ended."""
 

@@ -96,7 +96,7 @@ def stream_summary(
     locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
     fitted_to, of = typical(counts.delays)
     fitted = best_fit(fitted_to) if fit else None
-    skew, peak = result.course.skew(), counts.delays.evenness.peak(result.period_ns)
+    skew, peak = result.floor.skew(), counts.delays.evenness.peak(result.period_ns)
     names = [station.name for station in result.config.stations]
     diagnoses = diagnose(Scene(result, clock, others))
     rows = budget(counts.delays.delay, counts.delays.pdv, counts.windows.to_tick, departures=departures)
@@ -132,9 +132,7 @@ def stream_summary(
             "hours": counts.hours.to_json(result.rate),
             "floor": [
                 [start_ns, ms(least)]
-                for start_ns, least in zip(
-                    result.course.start_ns.tolist(), result.course.least_ns.tolist(), strict=True
-                )
+                for start_ns, least in zip(result.floor.start_ns.tolist(), result.floor.least_ns.tolist(), strict=True)
             ],
             "silences": [
                 {"after_s": silence.after_ns / timebase.NS, "length_s": silence.length_ns / timebase.NS}

@@ -76,7 +76,7 @@ def test_chunked_is_the_whole(frames: Batch, size: int, gather: int, intervals: 
     result = meter.result()
     alike(result.counts, whole.counts)
     assert told <= result.counts.slots.received
-    assert np.array_equal(result.course.least_ns, whole.course.least_ns)
+    assert np.array_equal(result.floor.least_ns, whole.floor.least_ns)
     assert result.silences == whole.silences
     slots = result.counts.slots
     assert slots.frames == len(frames) == slots.received + slots.duplicated + slots.stale
