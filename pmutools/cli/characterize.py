@@ -172,7 +172,14 @@ def _live(asked: Asked, talk: Talk, verbose: int, stop: Callable[[], bool]) -> t
     with ExitStack() as stack:
         endpoints = [each.endpoint for each in wanted]
         source = stack.enter_context(
-            LiveSource(endpoints, duration_ns=asked.duration_ns, configs=_saved(sites), tell=tell, stop=stage.over)
+            LiveSource(
+                endpoints,
+                duration_ns=asked.duration_ns,
+                configs=_saved(sites),
+                tell=tell,
+                tell_host=stage.hear_host,
+                stop=stage.over,
+            )
         )
         begin_ns = source.clock.realtime_ns()
         from pmutools.clocksources.watch import ClockWatch

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent
-from pmutools.tools.news import USUAL, Reasons, told
+from pmutools.timebase import NS
+from pmutools.tools.news import USUAL, Reasons, host_told, told
 
 PLACES = 10_000
 """So many places are remembered for what was said of them; more come from a flood only."""
+
+
+LONG_STALL_NS = NS
+"""Shorter ones come with any load: they hold up what is shown, and lose nothing."""
 
 
 class News:
@@ -21,6 +27,11 @@ class News:
         self.reasons = Reasons()
         self._say, self._verbose = say, verbose
         self._said: dict[str, str] = {}
+
+    def host(self, event: Stall | ClockStep) -> None:
+        """Of this machine: that its clock was set, and long stalls; with ``verbose`` all of them."""
+        if self._verbose or isinstance(event, ClockStep) or event.length_ns >= LONG_STALL_NS:
+            self._say(host_told(event))
 
     def __call__(self, event: LinkEvent) -> None:
         self.reasons.hear(event)

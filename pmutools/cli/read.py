@@ -138,7 +138,13 @@ def command(
     with interruptible() as stop, ExitStack() as stack:
         stage = Stage(talk, verbose, stop)
         source = stack.enter_context(
-            LiveSource(_endpoints(urls, ini), duration_ns=duration_ns, tell=stage.hear, stop=stage.over)
+            LiveSource(
+                _endpoints(urls, ini),
+                duration_ns=duration_ns,
+                tell=stage.hear,
+                tell_host=stage.hear_host,
+                stop=stage.over,
+            )
         )
         from pmutools.tools.reader.recorder import Recording  # slow to import: the sockets are bound by now
         from pmutools.tools.reader.ring import WINDOW, Window

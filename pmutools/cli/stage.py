@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from pmutools.c37118.demux import Loss, Message
     from pmutools.cli.live_show import LiveShow
     from pmutools.formats.source import Block
+    from pmutools.host import ClockStep, Stall
     from pmutools.net.dialogue import LinkEvent
     from pmutools.tools.live import LiveSource
 
 
 class Stage:
-    """Made before the source, which is given :meth:`hear` and :meth:`over`; :meth:`open` begins the display."""
+    """Made before the source, which is given :meth:`hear`, :meth:`hear_host` and :meth:`over`; :meth:`open` begins the display."""
 
     def __init__(self, talk: Talk, verbose: int, stop: Callable[[], bool]) -> None:
         self._talk, self._herald, self._stop = talk, Herald(talk), stop
@@ -43,6 +44,10 @@ class Stage:
         self._news(event)
         if self._show is not None:
             self._show.hear(event)
+
+    def hear_host(self, event: Stall | ClockStep) -> None:
+        """News of this machine, as the source tells them."""
+        self._news.host(event)
 
     def over(self) -> bool:
         """Whether the end was asked for, by a signal or in the display."""

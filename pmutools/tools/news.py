@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent, LinkKind
 
 USUAL = frozenset((LinkKind.BOUND, LinkKind.CONNECTED, LinkKind.CONFIGURED, LinkKind.STREAMING))
@@ -17,6 +18,13 @@ def told(event: LinkEvent) -> str:
     """The news without where it happened, which is said beside it."""
     detail = event.detail.removeprefix(f"{event.where}: ")
     return f"{event.kind}: {detail}" if detail else str(event.kind)
+
+
+def host_told(event: Stall | ClockStep) -> str:
+    """The news of the measuring machine."""
+    if isinstance(event, Stall):
+        return f"the measuring host stood still for {event.length_ns / 1e6:.0f} ms"
+    return f"the receiver's clock was set by {event.step_ns / 1e6:+.3f} ms"
 
 
 class Reasons:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from pmutools.cli.news import News
+from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.timebase import NS
 from pmutools.tools.news import Reasons, told
 
 URL = "tcp://192.0.2.1:4712"
@@ -50,3 +53,18 @@ def test_every_kind_of_news_has_words() -> None:
         assert "{" not in reasons.why(3)
         assert told(event(kind, f"{URL}: detail")) == f"{kind}: detail"
     assert told(event(LinkKind.SILENT)) == "silent"
+
+
+def test_what_the_machine_did_is_told_where_it_may_matter() -> None:
+    happened = [Stall(0, 0, 80_000_000), Stall(0, 0, 3 * NS), ClockStep(0, 0, -2_500_000)]
+    words = [
+        "the measuring host stood still for 80 ms",
+        "the measuring host stood still for 3000 ms",
+        "the receiver's clock was set by -2.500 ms",
+    ]
+    for verbose, expected in ((0, words[1:]), (1, words)):
+        said: list[str] = []
+        news = News(said.append, verbose)
+        for each in happened:
+            news.host(each)
+        assert said == expected

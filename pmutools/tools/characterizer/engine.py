@@ -18,6 +18,7 @@ from pmutools.c37118.demux import Loss, Message
 from pmutools.c37118.framer import SkipReason
 from pmutools.flow import Flow
 from pmutools.formats.source import Block
+from pmutools.host import ClockStep, Stall
 from pmutools.measure.clockquality import ClockLog, ClockQuality
 from pmutools.measure.completeness import Alignment
 from pmutools.measure.quality import Events
@@ -27,7 +28,7 @@ from pmutools.tools.characterizer.chronicle import Chronicle
 from pmutools.tools.characterizer.gauge import Gauge, Seat
 from pmutools.tools.characterizer.naming import Owners, identity_of, key_of, nobody, silent_identity
 from pmutools.tools.characterizer.wanted import Wanted
-from pmutools.tools.news import USUAL, told
+from pmutools.tools.news import USUAL, host_told, told
 
 MAX_STREAMS = 4096
 """So many are measured, at some 600 KiB each; frames of more are counted in ``unmeasured``."""
@@ -199,13 +200,13 @@ class Engine:
     def clock_stepped(self, step_ns: int, now_ns: int) -> None:
         """The receiver's clock was set by so much."""
         self.clock.stepped(step_ns)
-        self.chronicle.add(now_ns, f"the receiver's clock was set by {step_ns / _MS:+.3f} ms")
+        self.chronicle.add(now_ns, host_told(ClockStep(0, now_ns, step_ns)))
         for gauge in self.gauges:
             self._emit(gauge, gauge.meter.clock_stepped())
 
     def stalled(self, length_ns: int, now_ns: int) -> None:
         """The measuring host stood still for so long: a matter of all streams."""
-        self.chronicle.add(now_ns, f"the measuring host stood still for {length_ns / _MS:.0f} ms")
+        self.chronicle.add(now_ns, host_told(Stall(0, now_ns, length_ns)))
         for events in (self.host, *(gauge.meter.events for gauge in self.gauges)):
             events.stalls += 1
             events.longest_stall_ms = max(events.longest_stall_ms, length_ns / _MS)
