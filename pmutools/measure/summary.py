@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,17 +26,20 @@ def summary(
     alignments: Sequence[Alignment] = (),
     *,
     host: Events | None = None,
-    fits: bool = True,
+    may_fit: Callable[[], bool] = lambda: True,
+    departures: Sequence[Departures] | None = None,
 ) -> dict[str, Any]:
-    """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed. A fit takes some 25 ms.
+    """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed.
 
-    ``host`` is what happened that belongs to no stream alone, with all drops of this machine's sockets: streams that
+    Delays are fitted as long as ``may_fit`` says so: a fit takes some 25 ms. ``departures`` are what the sender's
+    ledger tells, a stream each. ``host`` is what happened that belongs to no stream alone, with all drops of this machine's sockets: streams that
     share one were each told of the same drops.
     """
     peers, whole = peers_of(results), Whole()
     streams = []
-    for result in results:
-        streams.append(stream_summary(result, clock, peers, fit=fits))
+    for number, result in enumerate(results):
+        known = None if departures is None else departures[number]
+        streams.append(stream_summary(result, clock, peers, fit=may_fit(), departures=known))
         whole.add(result)
     return {"clock": safe(clock.to_json()), "streams": streams, "all": whole.to_json(alignments, host)}
 
@@ -117,7 +120,7 @@ def stream_summary(
             "quality": counts.quality.to_json(counts.slots.expected, counts.slots.received, names),
             "fit": {**fitted.to_json(), "of": of} if fitted else None,
             "diagnoses": [diagnosis._asdict() for diagnosis in diagnoses],
-            # what follows is beyond the agreed keys
+            # what follows may grow
             **_more(counts),
             "where": identity.where,
             "other_names": list(identity.others),

@@ -87,7 +87,7 @@ def run_of(
         alignment.close(200 * MS)
     results, courses = [result for result, _, _ in found], [course for _, course, _ in found]
     alignments = [] if alignment is None else [alignment]
-    told = summary(results, clock_log or clock(), alignments, fits=fits)
+    told = summary(results, clock_log or clock(), alignments, may_fit=lambda: fits)
     run = Run(told, results, courses, alignments, source=source, **more)
     return replace(run, verdicts=verdicts(parse_requirements(require), told)) if require else run
 

@@ -28,7 +28,7 @@ from pmutools.timebase import NS
 from pmutools.tools.characterizer.engine import Engine, merged
 from pmutools.tools.characterizer.intervals import Intervals
 from pmutools.tools.characterizer.job import groups
-from pmutools.tools.characterizer.telling import checkpoint, final_summary, results_of, run_part
+from pmutools.tools.characterizer.summaries import checkpoint, final_summary, results_of, run_part
 from pmutools.tools.characterizer.wanted import Wanted
 
 HERE = "192.0.2.9:4713"

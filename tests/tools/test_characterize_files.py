@@ -24,7 +24,7 @@ from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.names import SUMMARY
 from pmutools.tools.characterizer.recorder import Recorder
 from pmutools.tools.characterizer.samples import Samples
-from pmutools.tools.characterizer.telling import run_part
+from pmutools.tools.characterizer.summaries import run_part
 
 FLOW = Flow("udp", "192.0.2.1:4713", "192.0.2.9:4713")
 

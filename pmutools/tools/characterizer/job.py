@@ -28,7 +28,7 @@ from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.hostwatch import HostWatch
 from pmutools.tools.characterizer.names import SUMMARY
 from pmutools.tools.characterizer.recorder import Recorder
-from pmutools.tools.characterizer.telling import final_summary, results_of, run_part
+from pmutools.tools.characterizer.summaries import final_summary, results_of, run_part
 from pmutools.tools.characterizer.truth import Truth, hold_to
 from pmutools.tools.live import ROUND_NS, LiveSource
 

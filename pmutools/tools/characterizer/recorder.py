@@ -19,7 +19,7 @@ from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.intervals import Intervals
 from pmutools.tools.characterizer.names import INTERVALS, SUMMARY
 from pmutools.tools.characterizer.samples import Samples
-from pmutools.tools.characterizer.telling import checkpoint
+from pmutools.tools.characterizer.summaries import checkpoint
 
 FLUSH_NS = NS
 """What a run that is killed can lose of its files; of more than 16 streams also what is gathered of each."""

@@ -8,10 +8,8 @@ from typing import Any
 
 from pmutools import __version__, timebase
 from pmutools.measure.budget import Departures
-from pmutools.measure.completeness import Alignment
-from pmutools.measure.scene import peers_of
 from pmutools.measure.stream import StreamResult
-from pmutools.measure.summary import Whole, safe, stream_summary
+from pmutools.measure.summary import Whole, safe, stream_summary, summary
 from pmutools.tools.characterizer.engine import Engine
 
 Extra = Callable[[], Mapping[str, Any]]
@@ -77,13 +75,7 @@ def final_summary(
     may_fit: Callable[[], bool],
     departures: Sequence[Departures] | None = None,
 ) -> dict[str, Any]:
-    """The summary of a run that is over, as it will be written; fits as long as ``may_fit`` says so."""
-    peers = peers_of(results)
-    whole, streams = Whole(), []
-    for number, result in enumerate(results):
-        known = None if departures is None else departures[number]
-        streams.append(stream_summary(result, engine.clock, peers, fit=may_fit(), departures=known))
-        whole.add(result)
-    alignments: list[Alignment] = list(engine.alignments.values())
-    told = whole.to_json(alignments, engine.host)
-    return {"clock": safe(engine.clock.to_json()), "streams": streams, "all": told, "run": dict(run)}
+    """The summary of a run that is over, as it will be written."""
+    alignments = list(engine.alignments.values())
+    told = summary(results, engine.clock, alignments, host=engine.host, may_fit=may_fit, departures=departures)
+    return told | {"run": dict(run)}
