@@ -253,13 +253,16 @@ def _progress(talk: Talk, stage: Stage | None = None) -> Observe:
 def _report(outcome: Outcome, asked: Asked, talk: Talk) -> None:
     """The report and the figures, where what they need is installed."""
     from pmutools.report import write_report
-    from pmutools.report.intervals import read_intervals
+    from pmutools.report.intervals import read_intervals, too_long
     from pmutools.tools.characterizer.names import INTERVALS
 
     talk.progress("writing the report")
+    run, intervals = outcome.run, asked.out / INTERVALS
+    left_out = too_long(intervals)
     run = replace(
-        outcome.run,
-        intervals=read_intervals(asked.out / INTERVALS),
+        run,
+        intervals=read_intervals(intervals),
+        news=[*run.news, (run.end_ns, left_out)] if left_out else run.news,
         compared_with="" if asked.before is None else str(asked.before),
         command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     )

@@ -417,4 +417,6 @@ def test_what_a_live_source_tells_of_the_host_is_handed_over_once() -> None:
     counts.out_of_order = 2  # another connection
     watch.look(9 * NS)
     assert events.out_of_order == 4
-    HostWatch(SimpleNamespace(), engine).look(0)
+    lines = list(engine.chronicle.lines())
+    HostWatch(SimpleNamespace(), engine).look(0)  # of a source that counts nothing
+    assert list(engine.chronicle.lines()) == lines and (events.stalls, events.retransmits) == (2, 1)
