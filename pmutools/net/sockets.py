@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import socket
 import struct
@@ -103,6 +104,15 @@ def explain(error: OSError, where: object) -> SourceError:
 
 SPARE_FILES = 64
 """Open files that a process needs beside its sockets."""
+
+
+def allow_all_files() -> None:
+    """Let this process open as many files as the system permits: there may be one a stream."""
+    with contextlib.suppress(ImportError, OSError, ValueError):  # Windows has no such limit; macOS another beside
+        import resource
+
+        _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def allow_open_files(count: int) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import W_OK, access
 from pathlib import Path
@@ -16,6 +15,7 @@ from pmutools.formats import JOURNAL, Sink, open_sink
 from pmutools.formats.columns import Phasors
 from pmutools.formats.fields import Fields
 from pmutools.formats.naming import Namer, safe, stream_name
+from pmutools.net.sockets import allow_all_files
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.conditions import Condition
 from pmutools.tools.reader.log import Log, Recorder
@@ -84,9 +84,7 @@ def _recorder(recording: Recording, source: LiveSource, tell: Callable[[str], No
         raise SettingsError("--split cuts one recording, --trigger makes one an event: choose one")
     if keep is not None and recording.split is None and not recording.triggers:
         raise SettingsError("--keep counts files of --split or --trigger; add one of them")
-    allow_many_files()
-    if not recording.to_stdout and (left := keep_journal(path)) is not None:
-        tell(f"{path} was not finished by the run before: its frames are kept in {left}; pmu convert makes them a file")
+    allow_all_files()
     if recording.triggers:
         _try(path, begin)
         watch = Watch(recording.triggers)
@@ -135,15 +133,3 @@ def _try(path: Path, begin: Callable[[Path], Sink]) -> None:
     sink.close()
     for left in sink.paths:
         left.unlink(missing_ok=True)
-
-
-def allow_many_files() -> None:
-    """Let this process open as many files as the system permits: there may be one a stream."""
-    if sys.platform == "win32":
-        return
-    import resource
-
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft != hard:
-        with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
