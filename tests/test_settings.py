@@ -14,7 +14,7 @@ from pmutools.errors import SettingsError
 from pmutools.parsers import boolean, integer, milliseconds_ns, number, parsed_by
 from pmutools.settings import Entry, Section, Where, fill, parse_ini
 
-CONTRACT = """\
+EXAMPLE = """\
 [DEFAULT]                     ; defaults for every [pmu ...]
 rate = 60                     ; reaches [pmu ...] sections only
 [pmu N1]
@@ -37,8 +37,8 @@ def texts(section: Section) -> dict[str, str]:
     return {key: entry.text for key, entry in section.entries.items()}
 
 
-def test_the_contracts_example() -> None:
-    ini = parse_ini(CONTRACT, "dcon.ini", defaults_for="pmu")
+def test_an_example() -> None:
+    ini = parse_ini(EXAMPLE, "dcon.ini", defaults_for="pmu")
     assert [section.name for section in ini.sections] == ["pmu N1", "pmu S1", "controller"]
     north, south = ini.family("pmu")
     assert texts(north) == {"rate": "60", "url": "udp://0.0.0.0:4801?source=192.0.2.11", "idcode": "101"}
@@ -130,7 +130,7 @@ def test_fill_errors(body: str, message: str) -> None:
 
 
 def test_one_value_changed_from_outside() -> None:
-    ini = parse_ini(CONTRACT, "dcon.ini", defaults_for="pmu").changed("controller.GAIN_mw_per_mhz = 12")
+    ini = parse_ini(EXAMPLE, "dcon.ini", defaults_for="pmu").changed("controller.GAIN_mw_per_mhz = 12")
     section = ini.section("controller")
     assert section.entries["gain_mw_per_mhz"] == Entry("12", Where("--set", 0, "controller", "gain_mw_per_mhz"))
     assert section.entries["priority"].text == "N1-S1,\nN1-S2"

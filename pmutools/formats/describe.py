@@ -1,6 +1,6 @@
 """Frames as plain objects for people and programs: the one-line JSON of ``pmu dump --json``.
 
-SI units; NaN and infinity become null. Keys are listed in the project's contract and only ever added to.
+SI units; NaN and infinity become null. Keys are only ever added to; the data model lists them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What each command gives: data on stdout, talk on stderr, one JSON document, the exit codes of the contract."""
+"""What each command gives: data on stdout, talk on stderr, one JSON document, the documented exit codes."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ COLUMNS = [
     *(f"age_{name}_ms" for name in NAMES),
     *("compute_us", "late_us"),
 ]
-"""Contract, section 7; what follows them has been added since."""
+"""What follows them has been added since."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".jsonl"])
-def test_a_simulated_session_exports_with_the_columns_of_the_contract(
+def test_a_simulated_session_exports_with_the_documented_columns(
     suffix: str, session: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
     out = tmp_path / f"ticks{suffix}"

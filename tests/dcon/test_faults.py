@@ -94,7 +94,7 @@ def per_stamp(session: Session) -> dict[str, dict[int, float]]:
     return found
 
 
-def test_every_fault_of_the_contract_is_there() -> None:
+def test_every_fault_is_there() -> None:
     assert set(FAULTS) == {
         *("stream-stop", "all-stop", "dropout", "two-zero-arrival", "south-delay-3", "south-delay-6"),
         *("table1-delays", "irregular"),

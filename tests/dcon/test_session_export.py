@@ -1,4 +1,4 @@
-"""``dcon export``: the contract's columns, the log's values, whatever the format."""
+"""``dcon export``: the documented columns, the log's values, whatever the format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dcon.session import export as export_module
 from dcon.session.export import export
 from pmutools.errors import SettingsError, SourceError
 
-CONTRACT = [
+FIRST = [
     *("tick_ns", "state", "mode", "active_instance", "gain_mw_per_mhz", "delta_f_mhz", "command_mw"),
     *("output_v", "pdci_mw", "flags"),
     *(f"f_{name}_hz" for name in PMUS),
@@ -101,11 +101,11 @@ def test_every_format_holds_the_same_rows(
     assert exact(other) == exact(rows)
 
 
-def test_tick_columns_are_those_of_the_contract(session: Path, tmp_path: Path) -> None:
+def test_tick_columns_are_the_documented_ones(session: Path, tmp_path: Path) -> None:
     out = tmp_path / "t.parquet"
     export(session, out)
     schema = pq.read_schema(out)
-    assert schema.names == CONTRACT + ADDED
+    assert schema.names == FIRST + ADDED
     assert schema.field("flags").type == pa.uint64()
     assert schema.field("tick_ns").type == pa.int64()
     assert not schema.field("command_mw").nullable

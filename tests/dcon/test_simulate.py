@@ -58,7 +58,7 @@ def test_the_parts_of_a_delay_make_the_whole(total_ms: float) -> None:
     assert parts.phase_ns <= 71_000_000  # so that no frame is late, whatever the whole
 
 
-def test_json_has_the_keys_of_the_contract(capsys: Capsys) -> None:
+def test_json_has_the_documented_keys(capsys: Capsys) -> None:
     (result,) = told(capsys, "cjb", "--no-control", "--duration", "12")
     assert tuple(result) == KEYS
     assert result["mode"] is None

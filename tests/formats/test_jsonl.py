@@ -80,7 +80,7 @@ def test_several_streams_and_a_changed_configuration(tmp_path: Path) -> None:
 
 
 def bare(number: int, **more: Any) -> str:
-    """A data object with what the contract names, of a program that is not ours."""
+    """A data object with what the data model names, of a program that is not ours."""
     station = {
         "name": "Umspannwerk Köln-Nord",
         "stat": 0,

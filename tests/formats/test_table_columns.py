@@ -63,7 +63,7 @@ def names(*stations: Station, style: Phasors = "polar") -> list[str]:
     return [column.name for column in columns_of(StreamConfig(7, stations, 50), style)]
 
 
-def test_columns_are_named_as_the_contract_says() -> None:
+def test_columns_are_named_as_documented() -> None:
     assert names(station("North", "VA", analogs=("P",), words=2)) == [
         "North.stat",
         "North.freq_hz",

@@ -85,7 +85,7 @@ def test_proto_text_and_descriptors_agree() -> None:
     assert parsed == described
 
 
-def test_contract_topics_are_all_there() -> None:
+def test_all_topics_are_there() -> None:
     dcon = {f"/dcon/{name}" for name in ("tick", "instance", "event", "setting", "watchdog", "timing", "pdci")}
     assert {message.topic for message in MESSAGES.values()} == {"/pmu/NAME/frame"} | dcon
 

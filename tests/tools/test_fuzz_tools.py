@@ -98,7 +98,7 @@ def file_of(suffix: str, content: bytes) -> Iterator[Path]:
 
 
 def fair(result: Result, *, silent: bool = False) -> None:
-    """An exit code of the contract; where it failed, one line says why, and nothing is internal to us."""
+    """A documented exit code; where it failed, one line says why, and nothing is internal to us."""
     assert result.code in (0, 1, 2, 3)
     assert "internal error" not in result.err
     assert "Traceback" not in result.err
