@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 
 class Stage:
-    """Made before the source, which is given :meth:`hear`, :meth:`hear_host` and :meth:`over`; :meth:`open` begins the show."""
+    """Made before the source, which is given :meth:`hear`, :meth:`hear_host` and :meth:`over`.
+
+    :meth:`open` begins the display.
+    """
 
     def __init__(self, talk: Talk, verbose: int, stop: Callable[[], bool]) -> None:
         self._talk, self._herald, self._stop = talk, Herald(talk), stop

@@ -32,8 +32,8 @@ def summary(
     """The whole, JSON-safe: ``clock``, ``streams``, ``all``. Alignments must be closed.
 
     Delays are fitted as long as ``may_fit`` says so: a fit takes some 25 ms. ``departures`` are what the sender's
-    ledger tells, a stream each. ``host`` is what happened that belongs to no stream alone, with all drops of this machine's sockets: streams that
-    share one were each told of the same drops.
+    ledger tells, a stream each. ``host`` is what happened that belongs to no stream alone, with all drops of this
+    machine's sockets: streams that share one were each told of the same drops.
     """
     peers, whole = peers_of(results), Whole()
     streams = []
