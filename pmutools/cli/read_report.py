@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pmutools.tools.reader.recorder import Recording
 
 SHOWN_PATHS = 4
+SHOWN_SILENT = 20
 
 
 def list_fields(source: LiveSource, phasors: Literal["polar", "rect"], stage: Stage, talk: Talk, as_json: bool) -> int:
@@ -60,10 +61,13 @@ def report(
 ) -> int:
     paths = [str(path) for path in recorder.paths]
     if as_json and not recording.to_stdout:
-        click.echo(json.dumps(reading.to_json() | {"paths": paths}))
+        silent = [{"name": name, "why": stage.reasons.why(place)} for place, name in source.silent]
+        click.echo(json.dumps(reading.to_json() | {"silent": silent, "paths": paths}))
     talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
     for reason, nbytes in reading.skipped.items():
         talk.say(f"  {nbytes} bytes skipped: {reason}")
+    for place, name in source.silent[:SHOWN_SILENT] if reading.frames else ():
+        talk.say(f"  {name}: no data: {stage.reasons.why(place)}")
     if reading.own_drops:
         talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
     if stopped:

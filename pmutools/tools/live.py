@@ -9,7 +9,7 @@ from types import TracebackType
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
-from pmutools.c37118.demux import DataRun, Loss, Message
+from pmutools.c37118.demux import FLOWS, DataRun, Loss, Message
 from pmutools.clock import Clock, SystemClock
 from pmutools.flow import Chunk, Flow
 from pmutools.formats.source import Block, Gatherer, gather
@@ -66,6 +66,7 @@ class LiveSource:
         saved = (*configs, *saved_configs(site for site in self.sites if site is not None))
         self.receivers = Receivers(endpoints, self.clock, configs=saved, want_cfg3=want_cfg3, rcvbuf_bytes=rcvbuf_bytes)
         self.tally = self.receivers.demux.tally
+        self._owners: dict[tuple[Flow, int], tuple[int, ...]] = {}
         self.own_drops = 0
         """Datagrams lost in this machine's receive buffers: not the network's doing."""
         self.host = HostLog(self.clock)
@@ -166,9 +167,24 @@ class LiveSource:
         self._take_host_news()
 
     def sites_of(self, flow: Flow, idcode: int) -> tuple[Site, ...]:
-        """The sites that are in a stream; none where it was named by its URL only."""
-        found = (self.sites[index] for index in self.receivers.owners(flow, idcode))
+        """The sites that a stream belongs to, also when its connection has ended; none where URLs named it."""
+        owners = self.receivers.owners(flow, idcode)
+        if owners:
+            if len(self._owners) >= FLOWS:
+                self._owners.clear()
+            self._owners[flow, idcode] = owners
+        found = (self.sites[index] for index in owners or self._owners.get((flow, idcode), ()))
         return tuple(site for site in found if site is not None)
+
+    @property
+    def silent(self) -> list[tuple[int, str]]:
+        """Place and name of the endpoints from which no frame has come."""
+        heard, endpoints = self.receivers.routes.heard, self.receivers.endpoints
+        return [
+            (index, str(endpoint) if site is None else site.name)
+            for index, (endpoint, site) in enumerate(zip(endpoints, self.sites, strict=True))
+            if index not in heard
+        ]
 
     def name(self, flow: Flow, config: StreamConfig) -> str:
         """What a stream is called: as its sites, all of them with a ``+`` between, else as its configuration says."""
