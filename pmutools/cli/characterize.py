@@ -143,7 +143,7 @@ def _settings(asked: Asked) -> Settings:
         interval_ns=asked.interval_ns,
         ledger=asked.ledger,
         before=None if asked.before is None else load_summary(asked.before),
-        requirements=parse_requirements(asked.require) if asked.require else (),
+        requirements=parse_requirements(asked.require) if asked.require is not None else (),
         profile=asked.profile,
         exact_profile=asked.exact_profile,
     )

@@ -329,6 +329,7 @@ def test_real_captures_are_told_in_words_without_any_option(name: str, tmp_path:
         (("udp://127.0.0.1:1", "a.pcap"), 2, "not both at once"),
         (("a.pcap", "--no-samples", "--ledger", "t.parquet"), 2, "leave out --no-samples"),
         (("a.pcap", "--require", "speed<=1"), 2, "is nothing that is measured"),
+        (("a.pcap", "--require", ""), 2, "an empty limit"),
         (("a.pcap", "--compare", "nowhere"), 2, "name the folder of a run"),
         (("a.pcap", "--compare", "."), 2, "No such file"),
         (("a.pcap", "--wait", "soon"), 2, "is not a number"),
