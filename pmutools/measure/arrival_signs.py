@@ -40,9 +40,9 @@ def _own_drops(scene: Scene) -> str | None:
     if not counts.events.own_drops:
         return None
     return (
-        f"this host dropped {counts.events.own_drops} datagrams at its own socket ({counts.slots.lost} frames "
-        "are missing in "
-        "all): no loss of the network's; raise net.core.rmem_max, or give the measurement a core of its own"
+        f"this host dropped {counts.events.own_drops} datagrams at its own socket: up to {counts.own_lost} of the "
+        f"{counts.slots.lost} missing frames are no loss of the network's; raise net.core.rmem_max, or give the "
+        "measurement a core of its own"
     )
 
 
@@ -83,9 +83,13 @@ def _pauses(scene: Scene) -> str | None:
     runs = [(length, count) for length, count in losses.periods.items() if length * result.period_ns >= PAUSE_NS]
     if runs:
         times, longest = sum(count for _, count in runs), losses.longest
+        own = result.counts.own_lost
+        if own >= sum(length * count for length, count in runs):
+            return None  # this host's own doing, told elsewhere
+        besides = f" (up to {own} of the missing frames are this host's own drops)" if own else ""
         return (
             f"{longest} frames in a row are missing ({span_text(longest * result.period_ns)}), and a second or more "
-            f"{times} time(s): the sender was stopped, or the path was down"
+            f"{times} time(s): the sender was stopped, or the path was down{besides}"
         )
     if not result.silences:
         return None

@@ -75,7 +75,7 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[Differe
 
 def _differences(name: str, before: Mapping[str, Any], after: Mapping[str, Any]) -> Iterator[Difference]:
     for metric, worse in COMPARED.items():
-        read, unit, _ = METRICS[metric]
+        read, unit = METRICS[metric].read, METRICS[metric].unit
         one, other = read(before), read(after)
         if one is None and other is None:
             continue

@@ -36,7 +36,11 @@ def _section(result: StreamResult, exact: bool) -> list[str]:
     if fit := best_fit(delays):
         lines.append(f"delay = {histogram_text(delays) if exact else fit.text}{_manner(result)}")
         lines.append(f"; {fit.name}, KS distance {fit.ks:.3f}, {fit.frames} frames" if not exact else "; as counted")
-    if loss := loss_text(counts.slots.lost, counts.slots.expected, counts.losses.periods.mean):
+    lost, own = counts.slots.lost, counts.own_lost
+    if own:
+        lines.append(f"; {own} of the {lost} lost frames may be own drops of the measuring host: left out of the loss")
+    burst = counts.losses.periods.mean
+    if loss := loss_text(lost - own, counts.slots.expected - own, burst and min(burst, lost - own)):
         lines.append(f"loss = {loss}")
     if counts.slots.duplicated:
         lines.append(f"duplicate = {min(1.0, counts.slots.duplicated / counts.slots.received):.4%}")

@@ -71,6 +71,11 @@ class StreamCounts(Counts):
     quality: QualityCounts = field(default_factory=QualityCounts)
     events: Events = field(default_factory=Events)
 
+    @property
+    def own_lost(self) -> int:
+        """Lost frames that may be this host's own drops: all of them at most, a frame a datagram."""
+        return min(self.slots.lost, self.events.own_drops)
+
 
 @dataclass(frozen=True)
 class StreamResult:

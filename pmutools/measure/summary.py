@@ -203,6 +203,7 @@ def _more(counts: StreamCounts) -> dict[str, Any]:
     received = slots.received or None
     return {
         "frames": slots.frames,
+        "lost_own_at_most": counts.own_lost,
         "stale": slots.stale,
         "conflicting": slots.conflicting,
         "replicated_share": slots.replicated / received if received else None,

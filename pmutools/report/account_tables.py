@@ -21,7 +21,7 @@ def verdict_table(view: View, *, holds: bool) -> Table:
                 Cell(each.requirement.text),
                 Cell(clean(each.stream)),
                 Cell(_measured(each.value, METRICS[each.requirement.name].unit), each.value),
-                Cell(word, tone=tone),
+                Cell(f"{word}: {each.note}" if each.note else word, tone=tone),
             ]
         )
         for each in view.run.verdicts

@@ -127,6 +127,8 @@ def _loss(view: View) -> Iterator[str]:
     whose = f"{worst.label} lost" if len(view.measured) > 1 else "it lost"
     much = f"most: {percent(_lost_share(worst.told))}" if len(view.measured) > 1 else count(worst.told["lost"])
     yield f"{begin} ({percent(told['received'] / told['expected'])}); {whose} {much}, {longest}."
+    if own := told["lost_own_at_most"]:
+        yield f"Up to {count(own)} of these losses may be this host's own drops, not the network's."
 
 
 def _lost_share(told: Mapping[str, Any]) -> float:

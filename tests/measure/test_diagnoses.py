@@ -57,6 +57,13 @@ def with_events(**counted: Any) -> StreamResult:
     return result
 
 
+def dropped(datagrams: int) -> StreamResult:
+    """300 frames in a row are missing, and the socket dropped so many datagrams."""
+    result = slots(np.append(np.arange(6000), np.arange(6300, COUNT)))
+    result.counts.events.own_drops = datagrams
+    return result
+
+
 def peers(*results: StreamResult) -> tuple[Peer, ...]:
     return peers_of(results)
 
@@ -185,6 +192,7 @@ SICK: dict[str, tuple[Scene, str]] = {
     "off-grid": (Scene(stream(time_ns=stamps(range(COUNT)) + RNG.integers(0, 8 * MS, COUNT)), clock()), "%"),
     "two-senders": (Scene(slots(np.repeat(np.arange(COUNT), 2)), clock()), "byte for byte the same"),
     "own-drops": (Scene(with_events(own_drops=96), clock()), "dropped 96 datagrams"),
+    "own-drops of some": (Scene(dropped(200), clock()), "up to 200 of the 300 missing frames"),
     "host-stalls": (Scene(with_events(stalls=3, longest_stall_ms=80.0), clock()), "3 time(s), for up to 80 ms"),
     "multicast-ageing": (Scene(silent_after(260), clock()), "silent 260 s"),
     "tcp-batching": (Scene(stream(source=StampSource.KERNEL_BATCHED), clock()), "100%"),
@@ -280,6 +288,7 @@ def test_every_row_has_a_case() -> None:
         ("two-senders", Scene(with_events(senders=1), clock())),
         ("reconnects", Scene(with_events(connects=1), clock())),
         ("pauses", Scene(slots(np.append(np.arange(6000), np.arange(6030, COUNT))), clock())),
+        ("pauses", Scene(dropped(300), clock())),
         ("periodic-delay", Scene(stream(delay_ms=44 + 0.3 * np.sin(np.arange(COUNT) * 2 * np.pi / 30)), clock())),
     ],
 )

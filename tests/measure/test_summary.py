@@ -14,6 +14,7 @@ from pmutools.errors import SettingsError
 from pmutools.measure.clockquality import ClockLog, ClockQuality, KernelClock
 from pmutools.measure.compare import compare
 from pmutools.measure.completeness import Alignment
+from pmutools.measure.profile import profile_text
 from pmutools.measure.require import METRICS, parse_requirements, verdicts
 from pmutools.measure.stream import Identity, StreamMeter
 from pmutools.measure.summary import interval_summary, summary
@@ -188,6 +189,35 @@ def test_a_limit_that_concerns_no_stream_does_not_hold() -> None:
     assert not verdict.holds
     assert str(verdict) == "FAIL N11: N11.loss<=1% (no such stream; did you mean 'N1'?)"
     assert not verdicts(parse_requirements("loss<=1%"), summary([], ClockLog()))[0].holds
+
+
+def dropped(lost: int, own: int) -> Any:
+    """A stream that lost so many frames in a row, while its socket dropped so many datagrams."""
+    result = measured(batch(stamps([*range(1000), *range(1000 + lost, 3000)])))
+    result.counts.events.own_drops = own
+    return result
+
+
+def test_own_drops_are_no_loss_of_the_network() -> None:
+    told = summary([dropped(200, 150)], ClockLog(), fits=False)
+    (stream,) = told["streams"]
+    assert (stream["lost"], stream["lost_own_at_most"], told["all"]["lost_own_at_most"]) == (200, 150, 150)
+    asked = parse_requirements("loss<=1%,all.loss<=1%,loss<=10%,availability>=99%,delay_p99<=10ms")
+    loss, whole, kept, available, delay = verdicts(asked, told)
+    assert not loss.holds and loss.value is None and "own drops: cannot be judged" in str(loss)
+    assert not whole.holds and "own drops" in str(whole)
+    assert kept.holds and kept.value == pytest.approx(200 / 3000)  # even with them
+    assert not available.holds and "own drops" in str(available)
+    assert not delay.holds and delay.value is not None and "own drops" not in str(delay)
+
+
+@pytest.mark.parametrize(("own", "loss"), [(0, "gemodel(0.0357%, 0.5000%)"), (150, None), (900, "")])
+def test_a_profile_leaves_own_drops_out(own: int, loss: str | None) -> None:
+    text = profile_text([dropped(200, own)])
+    assert ("own drops" in text) == bool(own)
+    assert ("\nloss = " in text) == (own < 200)
+    if loss:
+        assert f"loss = {loss}" in text
 
 
 def test_two_runs_compared() -> None:

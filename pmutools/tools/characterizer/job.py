@@ -167,7 +167,8 @@ class Job:
         judged = verdicts(settings.requirements, summary)
         if judged:
             summary["require"] = [
-                {"text": v.requirement.text, "stream": v.stream, "value": v.value, "holds": v.holds} for v in judged
+                {"text": v.requirement.text, "stream": v.stream, "value": v.value, "holds": v.holds, "note": v.note}
+                for v in judged
             ]
         differences = [] if settings.before is None else compare(settings.before, summary)
         if differences:
