@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pmutools.flow import StampSource
 from pmutools.measure.delay import BURST_SHARE
+from pmutools.measure.device_signs import is_frozen
 from pmutools.measure.scene import ENOUGH, Row, Scene, ms_text, span_text
 from pmutools.measure.stream import SILENCE_NS
 from pmutools.timebase import NS
@@ -81,6 +82,8 @@ def _retransmits(scene: Scene) -> str | None:
 def _pauses(scene: Scene) -> str | None:
     result, losses = scene.result, scene.result.counts.losses
     runs = [(length, count) for length, count in losses.periods.items() if length * result.period_ns >= PAUSE_NS]
+    if is_frozen(scene):
+        return None  # told as such
     if runs:
         times, longest = sum(count for _, count in runs), losses.longest
         own = result.counts.own_lost

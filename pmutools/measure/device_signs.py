@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pmutools.c37118.constants import Format, Stat, stat_trigger_reason
-from pmutools.measure.scene import ENOUGH, Row, Scene
-from pmutools.timebase import NS
+from pmutools.measure.scene import ENOUGH, Row, Scene, span_text
+from pmutools.timebase import NS, format_utc
 
 _ENOUGH_STEPS = 20
+FROZEN_FRAMES = 10
+"""So many frames in a row with one stamp are no copies any more ..."""
+FROZEN_PERIODS = 5
+"""... where they come over so many periods."""
+STOPPED_NS, STOPPED_PERIODS = 3 * NS, 30
 NO_TIME_BASE = 0xFFFFFF
 """All bits of TIME_BASE: a default, more likely than a clock of 16.8 MHz."""
 
@@ -26,6 +31,39 @@ def _silent(scene: Scene) -> str | None:
     return (
         f"not a single frame came{where}: is the sender on, and sending to this address and port? "
         "A device answers to its own IDCODE only"
+    )
+
+
+def is_frozen(scene: Scene) -> bool:
+    """Whether stamps stood still while frames went on coming."""
+    still, known = scene.result.standstill, scene.result.first_arrival_ns is not None
+    over = FROZEN_PERIODS * scene.result.period_ns if known else 0
+    return still.frames >= FROZEN_FRAMES and still.length_ns >= over
+
+
+def _frozen(scene: Scene) -> str | None:
+    if not is_frozen(scene):
+        return None
+    still = scene.result.standstill
+    lasting = f" over {span_text(still.length_ns)}" if still.length_ns else ""
+    return (
+        f"{still.frames} frames in a row{lasting} have the same stamp, {format_utc(still.stamp_ns)}"
+        f"{'' if still.ended else ', to the end'}: the sender's clock or its processing hangs and it sends on; its "
+        "values are not of now, and the instants without a frame are nobody's loss on the way"
+    )
+
+
+def _stopped(scene: Scene) -> str | None:
+    result = scene.result
+    if not result.counts.slots.frames or result.silent_ns <= max(STOPPED_NS, STOPPED_PERIODS * result.period_ns):
+        return None
+    if is_frozen(scene) and not result.standstill.ended:
+        return None
+    came = result.last_arrival_ns != result.last_new_ns
+    what = "what came after that was copies or old stamps" if came else "nothing came after that"
+    return (
+        f"{result.identity.name} stopped {span_text(result.silent_ns)} before the end, and {what}: the sender, its "
+        "link or its connection is down; it is not counted as loss"
     )
 
 
@@ -190,6 +228,8 @@ def _unscaled(scene: Scene) -> str | None:
 
 ROWS: tuple[Row, ...] = (
     Row("silent", "no frame at all", _silent),
+    Row("stopped", "nothing new for 3 s and 30 periods at the end", _stopped),
+    Row("frozen-stamp", "10 or more frames in a row with the same stamp, over 5 periods or more", _frozen),
     Row("unexpected-rate", "another rate than the initialisation file's", _unwanted_rate),
     Row("config-changed", "another configuration while it ran", _changed),
     Row("stale-frames", "stamps far from those around them", _stale),

@@ -24,6 +24,7 @@ from pmutools.measure.quality import Events, QualityCounts, QualityMeter
 from pmutools.measure.sequence import LossCounts, OrderCounts
 from pmutools.measure.slotmeter import Part, SlotMeter
 from pmutools.measure.slots import HORIZON_S, OFF_GRID_SHARE, Placed, SlotCounts, Verdict
+from pmutools.measure.standstill import NO_STANDSTILL, Standstill, StandstillMeter
 from pmutools.measure.windows import WindowCounts, WindowMeter
 
 WAIT_NS = 200_000_000
@@ -98,6 +99,10 @@ class StreamResult:
     floor: FloorCourse
     end_ns: int | None = None
     """When the measurement ended."""
+    last_new_ns: int | None = None
+    """Arrival of the last frame that was the first of its slot: copies and old stamps bring nothing new."""
+    standstill: Standstill = NO_STANDSTILL
+    """The most frames in a row with one stamp."""
 
     @property
     def period_ns(self) -> float:
@@ -105,10 +110,9 @@ class StreamResult:
 
     @property
     def silent_ns(self) -> int:
-        """Since the last arrival, at the end: not loss."""
-        if self.end_ns is None or self.last_arrival_ns is None:
-            return 0
-        return max(0, self.end_ns - self.last_arrival_ns)
+        """Since anything new came, at the end: not loss."""
+        last_ns = self.last_arrival_ns if self.last_new_ns is None else self.last_new_ns
+        return 0 if self.end_ns is None or last_ns is None else max(0, self.end_ns - last_ns)
 
 
 class State(StrEnum):
@@ -180,6 +184,8 @@ class StreamMeter:
         self._last_ns: int | None = None
         self._first_arrival_ns: int | None = None
         self._last_arrival_ns: int | None = None
+        self._last_new_ns: int | None = None
+        self._standstill = StandstillMeter()
         self._silences: list[Silence] = []
         self._counted, self._gather = 0, gather
         self._gathered: list[Gist] = []
@@ -229,7 +235,7 @@ class StreamMeter:
         self._windows.restart(self._rate)
         self._rates.restart()
         self._delays.restart(self._slots.period_ns)
-        self._last_arrival_ns = None
+        self._last_arrival_ns = self._last_new_ns = None
         return found
 
     def _reconfigure(self, config: StreamConfig) -> list[Seen]:
@@ -258,6 +264,7 @@ class StreamMeter:
         if self._first_ns is None:
             self._first_ns = int(frames.time_ns[0])
         self._last_ns = int(frames.time_ns[-1])
+        self._standstill.add(frames)
         arrivals = frames.arrival_ns
         if (unknown := arrivals == NO_TIME).any():
             arrivals = arrivals[~unknown]
@@ -290,6 +297,7 @@ class StreamMeter:
         if (unseen := arrivals == NO_TIME).any():
             arrivals = arrivals[~unseen]
         if len(arrivals):
+            self._last_new_ns = int(arrivals[-1])
             self._windows.add(arrivals)
             self._rates.add(arrivals)
         return self._seen(frames, self._states(frames, placed), lost)
@@ -348,4 +356,6 @@ class StreamMeter:
             tuple(self._silences),
             self._delays.floor.course(),
             end_ns,
+            self._last_new_ns,
+            self._standstill.longest,
         )

@@ -64,6 +64,15 @@ def dropped(datagrams: int) -> StreamResult:
     return result
 
 
+def frozen(repeated: int, after: int = 0) -> StreamResult:
+    """600 frames, then one stamp so often, then ``after`` more."""
+    instants = [*range(600), *[600] * repeated, *range(600 + repeated, 600 + repeated + after)]
+    come = START_NS + np.arange(len(instants)) * NS // 60 + 20 * MS
+    times = stamps(instants)
+    frames = batch(times, (come - times) / MS, values=np.arange(len(instants)))
+    return measured(frames, end_ns=int(come[-1]))
+
+
 def peers(*results: StreamResult) -> tuple[Peer, ...]:
     return peers_of(results)
 
@@ -207,6 +216,12 @@ SICK: dict[str, tuple[Scene, str]] = {
     "silent": (Scene(nothing(), clock()), "not a single frame came at udp://192.0.2.1:4713"),
     "silent unconfigured": (Scene(nothing(before_config=7), clock()), "7 data frames came"),
     "silent corrupt": (Scene(nothing(corrupt=7), clock()), "7 frames with a wrong CHK"),
+    "stopped": (
+        Scene(stream(600, end_ns=START_NS + 20 * NS), clock()),
+        "N1 stopped 10.0 s before the end, and",
+    ),
+    "frozen-stamp": (Scene(frozen(3000), clock()), "3000 frames in a row over 50.0 s"),
+    "frozen-stamp for a while": (Scene(frozen(120, 1000), clock()), "120 frames in a row over 2.0 s"),
     "unexpected-rate": (
         Scene(stream(rate=30, identity=Identity("N1", 101, wanted_hz=60)), clock()),
         "60 frames/s are expected",
@@ -289,6 +304,11 @@ def test_every_row_has_a_case() -> None:
         ("reconnects", Scene(with_events(connects=1), clock())),
         ("pauses", Scene(slots(np.append(np.arange(6000), np.arange(6030, COUNT))), clock())),
         ("pauses", Scene(dropped(300), clock())),
+        ("stopped", Scene(stream(600, end_ns=START_NS + 12 * NS), clock())),
+        ("stopped", Scene(frozen(3000), clock())),
+        ("frozen-stamp", Scene(frozen(4, 1000), clock())),
+        ("frozen-stamp", Scene(slots(np.sort(np.append(np.arange(COUNT), [500] * 20))), clock())),
+        ("pauses", Scene(frozen(120, 1000), clock())),
         ("periodic-delay", Scene(stream(delay_ms=44 + 0.3 * np.sin(np.arange(COUNT) * 2 * np.pi / 30)), clock())),
     ],
 )

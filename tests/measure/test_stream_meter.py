@@ -6,7 +6,7 @@ import random
 from collections import Counter
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
@@ -173,6 +173,28 @@ def test_late_and_stale() -> None:
     counts = measured(arranged(batch(times, delays))).counts
     assert counts.delays.late == 1
     assert (counts.slots.stale, counts.slots.lost, counts.slots.received) == (1, 1, 5999)
+
+
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=60), st.integers(1, 9))
+def test_the_longest_run_of_one_stamp(instants: list[int], size: int) -> None:
+    runs = [(stamp, len(list(each))) for stamp, each in groupby(instants)]
+    most = max(count for _, count in runs)
+    frames, meter = batch(stamps(instants), 20.0), StreamMeter(Identity("N1", 101), config(), gather=1)
+    for at in range(0, len(frames), size):
+        meter.add(frames[at : at + size])
+    still = meter.result().standstill
+    stamp, at = next((stamp, at) for at, (stamp, count) in enumerate(runs) if count == most)
+    assert (still.frames, still.stamp_ns, still.ended) == (most, stamps([stamp])[0], at < len(runs) - 1)
+
+
+def test_copies_are_nothing_new() -> None:
+    """One stamp for 5 s on end is a silence of that length."""
+    slots = [*range(600), *[599] * 300]
+    come = START_NS + np.arange(900) * NS // 60
+    times = stamps(slots)
+    result = measured(batch(times, (come - times) / MS), end_ns=int(come[-1]))
+    assert result.silent_ns == 5 * NS
+    assert result.counts.slots.received == 600
 
 
 def test_off_grid() -> None:
