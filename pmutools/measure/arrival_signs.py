@@ -171,7 +171,7 @@ def _late(scene: Scene) -> str | None:
     if delays.delay.count < ENOUGH or delays.late < 0.001 * delays.delay.count:
         return None
     most = delays.delay.quantile_ns(0.999) or 0.0
-    if most > 10 * NS:
+    if most > 10 * NS or scene.result.clock_steps or scene.leaps:
         return None  # a clock's error, told elsewhere
     return (
         f"{delays.late / delays.delay.count:.2%} of the frames came after the concentrator's wait of "

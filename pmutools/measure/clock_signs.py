@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pmutools.c37118.constants import Stat, TimeQuality
 from pmutools.measure.clockquality import TAI_LESS_UTC_S
+from pmutools.measure.delay import SECOND_WITHIN_NS
 from pmutools.measure.floor import Skew, Step
 from pmutools.measure.histogram import NS_PER_MS
 from pmutools.measure.scene import Row, Scene, ms_text, span_text
@@ -81,7 +82,7 @@ def _unsynchronised(scene: Scene) -> str | None:
 
 def _leap(scene: Scene) -> str | None:
     counts = scene.result.counts
-    steps, flagged = counts.delays.second_steps, counts.quality.leap_flagged
+    steps, flagged = scene.leaps, counts.quality.leap_flagged
     if not steps and flagged and counts.slots.conflicting:
         return (
             f"{counts.slots.conflicting} stamps came twice, with other values, and {flagged} frames carry leap flags: "
@@ -93,6 +94,19 @@ def _leap(scene: Scene) -> str | None:
     return (
         f"the delay jumped by a whole second {steps} time(s) and {flags}: a leap second treated differently "
         "at both ends"
+    )
+
+
+def _set(scene: Scene) -> str | None:
+    """But for leap seconds, which are told as such."""
+    steps = [step for step in scene.result.clock_steps if abs(abs(step.change_ns) - NS) >= SECOND_WITHIN_NS]
+    if not steps:
+        return None
+    first = steps[0]
+    return (
+        f"the sender's clock was set {len(steps)} time(s), first {'ahead' if first.change_ns > 0 else 'back'} by "
+        f"{span_text(abs(first.change_ns))} at {format_utc(first.at_ns)}: its stamps jumped while frames kept coming. "
+        "Nothing of that is loss or a copy: slots are counted anew from there; delays before and after do not compare"
     )
 
 
@@ -130,6 +144,8 @@ def _step(scene: Scene) -> str | None:
     if (trend := _trend(scene)) is None:
         return None
     skew, step = trend
+    if scene.result.clock_steps or scene.leaps:
+        return None  # told as such
     if abs(step.change_ns) < max(NS_PER_MS, 6 * step.noise_ns) or 2 * step.noise_ns > skew.residual_ns:
         return None
     return (
@@ -146,6 +162,7 @@ ROWS: tuple[Row, ...] = (
     Row("locked-but-off", "MSG_TQ 0 on stamps 5 s or more from the receiver's clock", _locked_but_off),
     Row("unsynchronised", "STAT or MSG_TQ says not synchronised, data called valid", _unsynchronised),
     Row("leap-second", "delays that jump by 1 s, or stamps that come twice under leap flags", _leap),
+    Row("sender-clock-step", "stamps jump by 0.9 s and 10 periods or more while frames keep coming", _set),
     Row("leap-smear", "leap flags, and a delay that drifts by some 11.6 ppm", _smear),
     Row("clock-skew", "a slope of the delay's floor of 1 ppm or more", _skew),
     Row("latency-step", "a lasting change of the delay's floor", _step),

@@ -33,7 +33,7 @@ BURST_SHARE = 0.2
 """Frames closer together than this share of the period came as a burst."""
 _MEMORY = 1024
 _WEIGHTS = (15 / 16) ** np.arange(_MEMORY - 1, -1, -1.0) / 16
-_SECOND_WITHIN_NS = 50_000_000
+SECOND_WITHIN_NS = 50_000_000
 RESOLUTIONS_NS = (1_000, 1_000_000, 10_000_000)
 """Arrival stamps are looked at for being whole multiples of these."""
 
@@ -152,7 +152,7 @@ class DelayMeter:
         counts.bursts += int(np.count_nonzero(gaps < BURST_SHARE * self._period_ns))
         counts.together += int(np.count_nonzero(gaps == 0))
         size = np.abs(changes)
-        counts.second_steps += int(np.count_nonzero(np.abs(size - NS) < _SECOND_WITHIN_NS))
+        counts.second_steps += int(np.count_nonzero(np.abs(size - NS) < SECOND_WITHIN_NS))
         counts.slot_steps.add(steps if steps.min() > 0 else steps[steps > 0])
         recent = size[-_MEMORY:]
         self._jitter_ns = self._jitter_ns * (15 / 16) ** len(recent) + float(recent @ _WEIGHTS[-len(recent) :])

@@ -8,6 +8,7 @@ from statistics import median_low
 from typing import NamedTuple
 
 from pmutools.measure.clockquality import ClockLog
+from pmutools.measure.delay import SECOND_WITHIN_NS
 from pmutools.measure.histogram import NS_PER_MS
 from pmutools.measure.stream import StreamResult
 from pmutools.timebase import NS
@@ -46,6 +47,12 @@ class Scene:
     def middle_ns(self) -> float | None:
         """Median delay, of enough frames."""
         return _middle(self.result)
+
+    @property
+    def leaps(self) -> int:
+        """How often the delay changed by a whole second from a frame to the next."""
+        steps = (abs(abs(step.change_ns) - NS) < SECOND_WITHIN_NS for step in self.result.clock_steps)
+        return self.result.counts.delays.second_steps + sum(steps)
 
     @property
     def locked_share(self) -> float:

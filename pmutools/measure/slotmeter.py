@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pmutools import timebase
+from pmutools.measure.clockstep import ClockStep
 from pmutools.measure.columns import Flags, Frames, Ints
 from pmutools.measure.sequence import LossMeter, OrderMeter
 from pmutools.measure.slots import OFF_GRID_SHARE, Intake, Placed, Ring, SlotCounts, Verdict
@@ -38,6 +39,8 @@ class SlotMeter:
         self.counts = SlotCounts()
         self.losses = LossMeter()
         self._horizon_ns = horizon_ns
+        self.steps: list[ClockStep] = []
+        """The times that the sender's clock was set."""
         self._regrid(rate)
         self.order = OrderMeter(self.reach)
 
@@ -45,7 +48,7 @@ class SlotMeter:
         self.period_ns = timebase.NS / float(rate) if rate else timebase.NS
         self.reach = min(max(int(self._horizon_ns / self.period_ns), 16), _LONGEST_REACH)
         """The horizon, in slots."""
-        self._intake, self._ring = Intake(self.reach, self.period_ns), Ring(self.reach)
+        self._intake, self._ring = Intake(self.reach, self.period_ns, self.steps), Ring(self.reach)
 
     def restart(self, rate: Fraction) -> None:
         """What comes next is counted at another rate; :meth:`flush` and :meth:`close` before."""

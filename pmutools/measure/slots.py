@@ -11,6 +11,9 @@ lost all the same. A stamp that jumps further than the horizon is believed as fo
 - otherwise it is a stray, kept aside. The next :data:`CONFIRM` frames decide: where they go on from it, the sender's
   clock was set, and a new *epoch* begins there, without loss; where they do not, the strays were stale frames.
 
+A jump by less than the horizon is a clock that was set where frames keep coming (:mod:`pmutools.measure.clockstep`): a
+new epoch, too.
+
 So a device's first frames that are months old neither make a million losses nor spoil the delays.
 """
 
@@ -26,6 +29,7 @@ import numpy as np
 
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME
+from pmutools.measure.clockstep import ROWS, STEPS, ClockStep, StepWatch
 from pmutools.measure.columns import Flags, Frames, Ints, joined
 from pmutools.measure.counts import Counts
 
@@ -81,14 +85,34 @@ class Verdict(Enum):
 class Intake:
     """Splits frames where stamps jump further than ``reach`` slots, and says what to make of each part."""
 
-    def __init__(self, reach: int, period_ns: float) -> None:
+    def __init__(self, reach: int, period_ns: float, steps: list[ClockStep]) -> None:
         self._reach, self._period_ns = reach, period_ns
         self._head: int | None = None
         self._head_arrival_ns = NO_TIME
         self._aside: list[Frames] = []
+        self._watch = StepWatch(period_ns)
+        self.steps = steps
+        """The times that the sender's clock was set; the first :data:`~pmutools.measure.clockstep.STEPS`."""
 
     def feed(self, frames: Frames) -> Iterator[tuple[Verdict, Frames]]:
-        """Parts of what came so far, in order; up to :data:`CONFIRM` - 1 frames are kept for later."""
+        """Parts of what came so far, in order; a few frames are kept for later."""
+        for change_ns, part in self._watch.feed(frames):
+            yield from self._stepped(change_ns, part) if change_ns else self._split(part)
+
+    def _stepped(self, change_ns: int, part: Frames) -> Iterator[tuple[Verdict, Frames]]:
+        """A part with which the sender's clock was set."""
+        if self._aside:
+            yield Verdict.STALE, joined(self._aside)
+            self._aside = []
+        self._note(change_ns, int(part.arrival_ns[0]))
+        yield from self._accept(Verdict.RESTART, part[:ROWS])
+        yield from self._split(part[ROWS:])
+
+    def _note(self, change_ns: int, at_ns: int) -> None:
+        if len(self.steps) < STEPS:
+            self.steps.append(ClockStep(change_ns, at_ns))
+
+    def _split(self, frames: Frames) -> Iterator[tuple[Verdict, Frames]]:
         steps = np.abs(np.diff(frames.slot)) > self._reach
         if not steps.any():
             yield from self._part(frames)
@@ -98,7 +122,9 @@ class Intake:
             yield from self._part(frames[first:end])
 
     def flush(self) -> Iterator[tuple[Verdict, Frames]]:
-        """What was kept aside, at the end of the stream."""
+        """What was kept, at the end of the stream."""
+        for _, part in self._watch.flush():
+            yield from self._split(part)
         if self._aside:
             aside = joined(self._aside)
             yield from self._accept(Verdict.RESTART, aside) if self._head is None else ((Verdict.STALE, aside),)
@@ -129,6 +155,9 @@ class Intake:
             if self.waiting < CONFIRM:
                 return
             part, self._aside, verdict = joined(self._aside), [], Verdict.RESTART
+            if self._head is not None and NO_TIME not in (arrival_ns := int(part.arrival_ns[0]), self._head_arrival_ns):
+                stamped_ns = round((int(part.slot[0]) - self._head) * self._period_ns)
+                self._note(stamped_ns - (arrival_ns - self._head_arrival_ns), arrival_ns)
         if self._aside:
             yield Verdict.STALE, joined(self._aside)
             self._aside = []

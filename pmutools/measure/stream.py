@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME, Batch
 from pmutools.c37118.config import StreamConfig
+from pmutools.measure.clockstep import ClockStep
 from pmutools.measure.columns import Frames, Gist, Ints, frames_of, gathered, gist_of
 from pmutools.measure.counts import Counts
 from pmutools.measure.delay import DelayCounts, DelayMeter
@@ -103,6 +104,8 @@ class StreamResult:
     """Arrival of the last frame that was the first of its slot: copies and old stamps bring nothing new."""
     standstill: Standstill = NO_STANDSTILL
     """The most frames in a row with one stamp."""
+    clock_steps: tuple[ClockStep, ...] = ()
+    """The times that the sender's clock was set, each of which began an epoch."""
 
     @property
     def period_ns(self) -> float:
@@ -358,4 +361,5 @@ class StreamMeter:
             end_ns,
             self._last_new_ns,
             self._standstill.longest,
+            tuple(self._slots.steps),
         )

@@ -141,6 +141,9 @@ def stream_summary(
                 {"after_s": silence.after_ns / timebase.NS, "length_s": silence.length_ns / timebase.NS}
                 for silence in result.silences
             ],
+            "clock_steps": [
+                {"at": _utc(step.at_ns), "change_s": step.change_ns / timebase.NS} for step in result.clock_steps
+            ],
             "first": _utc(result.first_ns),
             "last": _utc(result.last_ns),
             "one_way_ms": departures.one_way.summary_ms() if departures else None,

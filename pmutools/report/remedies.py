@@ -9,6 +9,7 @@ REMEDIES = {
     "locked-but-off": "check date and GPS week of the sender's clock, and the receiver's date; do not trust MSG_TQ",
     "unsynchronised": "look to the sender's clock: its antenna, its cable, its holdover",
     "leap-second": "measure again away from the leap second",
+    "sender-clock-step": "look why the sender's clock was set: its antenna, its source of time; judge both parts apart",
     "leap-smear": "take time from servers that do not smear, or measure again a day later",
     "clock-skew": "discipline both clocks; PDV and inter-arrival times hold meanwhile",
     "latency-step": "look what was changed at that time: routes, filters (P or M class), clocks",

@@ -73,6 +73,13 @@ def frozen(repeated: int, after: int = 0) -> StreamResult:
     return measured(frames, end_ns=int(come[-1]))
 
 
+def stepped(by_s: float, count: int = 3600) -> StreamResult:
+    """The sender's clock is set in the middle; frames go on at their pace."""
+    come = START_NS + np.arange(count) * NS // 60
+    times = stamps((np.arange(count) + np.where(np.arange(count) >= count // 2, round(by_s * 60), 0)).tolist())
+    return measured(batch(times, (come - times) / MS + 20 + noise(count), values=np.arange(count)))
+
+
 def peers(*results: StreamResult) -> tuple[Peer, ...]:
     return peers_of(results)
 
@@ -212,6 +219,10 @@ SICK: dict[str, tuple[Scene, str]] = {
     ),
     "coarse-stamps base": (Scene(stream(of=replace(config(), time_base=1000)), clock()), "told to 1 ms"),
     "uneven-arrival": (Scene(stream(delay_ms=44 + sawtooth), clock()), "arrival is uneven"),
+    "sender-clock-step": (Scene(stepped(5), clock()), "ahead by 5.0 s"),
+    "sender-clock-step back": (Scene(stepped(-5), clock()), "back by 5.0 s"),
+    "sender-clock-step far": (Scene(stepped(-300), clock()), "back by 5.0 minutes"),
+    "leap-second inserted": (Scene(stepped(-1), clock()), "jumped by a whole second 1 time(s)"),
     "leap-smear": (Scene(smeared(), clock()), "smears the leap second"),
     "silent": (Scene(nothing(), clock()), "not a single frame came at udp://192.0.2.1:4713"),
     "silent unconfigured": (Scene(nothing(before_config=7), clock()), "7 data frames came"),
@@ -309,6 +320,13 @@ def test_every_row_has_a_case() -> None:
         ("frozen-stamp", Scene(frozen(4, 1000), clock())),
         ("frozen-stamp", Scene(slots(np.sort(np.append(np.arange(COUNT), [500] * 20))), clock())),
         ("pauses", Scene(frozen(120, 1000), clock())),
+        *((row, Scene(stepped(5), clock())) for row in ("pauses", "latency-step", "late-frames")),
+        *((row, Scene(stepped(-5), clock())) for row in ("two-senders", "latency-step", "late-frames")),
+        *((row, Scene(stepped(-1), clock())) for row in ("sender-clock-step", "latency-step", "late-frames")),
+        ("sender-clock-step", SICK["pauses"][0]),
+        ("sender-clock-step", SICK["pauses stored"][0]),
+        ("sender-clock-step", Scene(leapt(5), clock())),
+        ("sender-clock-step", SICK["stale-frames"][0]),
         ("periodic-delay", Scene(stream(delay_ms=44 + 0.3 * np.sin(np.arange(COUNT) * 2 * np.pi / 30)), clock())),
     ],
 )

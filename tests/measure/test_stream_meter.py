@@ -152,6 +152,41 @@ def test_a_clock_that_is_set_begins_an_epoch() -> None:
     assert result.counts.delays.negative == 300
 
 
+@pytest.mark.parametrize("by_slots", [300, -300, 60, -60])
+@pytest.mark.parametrize("size", [1, 7, 512])
+def test_a_clock_that_is_set_by_seconds_begins_an_epoch(by_slots: int, size: int) -> None:
+    slots = np.arange(600) + np.where(np.arange(600) >= 300, by_slots, 0)
+    come, times = START_NS + np.arange(600) * NS // 60, stamps(slots.tolist())
+    delays = (come - times) / MS + 20 + np.random.default_rng(2).exponential(3, 600)
+    frames, meter = arranged(batch(times, delays)), StreamMeter(Identity("N1", 101), config(), gather=1)
+    for at in range(0, 600, size):
+        meter.add(frames[at : at + size])
+    result = meter.result()
+    counts, (step,) = result.counts.slots, result.clock_steps
+    assert (counts.epochs, counts.expected, counts.received, counts.duplicated) == (2, 600, 600, 0)
+    assert step.change_ns == pytest.approx(by_slots * NS / 60, abs=10 * MS)
+
+
+@pytest.mark.parametrize("behind", [300, 60])
+def test_frames_that_are_behind_are_no_clock(behind: int) -> None:
+    """A lump of old frames, one late frame, and a second sender whose clock is behind."""
+    slots = np.arange(1200)
+    late = np.full(1200, 20.0)
+    late[400] += behind * 1000 / 60
+    lump = np.where((slots >= 600 - behind) & (slots < 600), (600 - slots) * 1000 / 60 + 20, 20.0)
+    other = batch(stamps((slots - behind).tolist()), behind * 1000 / 60 + 28)
+    both = np.concatenate((stamps(slots.tolist()), other.time_ns))
+    delays = np.concatenate((np.full(1200, 20.0), np.full(1200, behind * 1000 / 60 + 28)))
+    for frames in (
+        batch(stamps(slots.tolist()), late),
+        batch(stamps(slots.tolist()), lump),
+        batch(both, delays),
+    ):
+        result = measured(arranged(frames))
+        assert (result.clock_steps, result.counts.slots.epochs) == ((), 1)
+        assert result.counts.slots.lost == 0
+
+
 @pytest.mark.parametrize("arrivals", [True, False])
 def test_an_outage_is_loss(arrivals: bool) -> None:
     slots = [*range(100), *range(60 * 3600, 60 * 3600 + 100)]
