@@ -161,6 +161,36 @@ def test_a_full_disk_may_cost_the_intervals_too(tmp_path: Path, monkeypatch: pyt
     assert running.engine.gauges[0].frames == 12 * 59
 
 
+def test_a_full_disk_gives_the_journal_s_room_to_the_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = Running(tmp_path)
+    running.go(12)
+    refuse(monkeypatch, "samples")
+    running.go(2)
+    running.end()
+    journal, put = tmp_path / "samples.parquet.journal", running.folder.put
+    assert journal.exists()
+
+    def crowded(name: str, text: str) -> None:
+        if journal.exists():
+            raise SourceError(f"cannot write {name}: No space left on device")
+        put(name, text)
+
+    running.folder.put = crowded  # type: ignore[method-assign]
+    running.recorder.put_summary("{}")
+    assert (tmp_path / "summary.json").read_text() == "{}"
+    assert not journal.exists() and running.recorder.samples is None
+
+
+def test_a_summary_never_costs_samples_that_are_whole(tmp_path: Path) -> None:
+    running = Running(tmp_path)
+    running.go(2)
+    (tmp_path / "summary.json.new").mkdir()
+    with pytest.raises(SourceError, match=r"summary\.json"):
+        running.recorder.put_summary("{}")
+    running.end()
+    assert (tmp_path / "samples.parquet").exists()
+
+
 def test_a_summary_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     folder = Folder(tmp_path / "new" / "run")
     folder.put("x.json", "{}")

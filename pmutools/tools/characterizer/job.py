@@ -258,7 +258,7 @@ class Job:
         settings, recorder = self._settings, self._recorder
         assert recorder is not None
         try:
-            self._folder.put(SUMMARY, json.dumps(outcome.run.summary, allow_nan=False) + "\n")
+            recorder.put_summary(json.dumps(outcome.run.summary, allow_nan=False) + "\n")
             outcome.paths.append(self._folder.path / SUMMARY)
         except SourceError as error:
             outcome.failures.append(str(error))

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from pmutools.errors import SourceError
+from pmutools.formats import JOURNAL
 from pmutools.formats.output import OutputFile
 from pmutools.timebase import NS
 from pmutools.tools.characterizer.chores import Chores
 from pmutools.tools.characterizer.engine import Engine
 from pmutools.tools.characterizer.folder import Folder
 from pmutools.tools.characterizer.intervals import Intervals
-from pmutools.tools.characterizer.names import INTERVALS, SUMMARY
+from pmutools.tools.characterizer.names import INTERVALS, SAMPLES, SUMMARY
 from pmutools.tools.characterizer.samples import Samples
 from pmutools.tools.characterizer.summaries import checkpoint
 
@@ -116,6 +117,14 @@ class Recorder:
                     if output is self.samples:
                         self._give_up_samples()
 
+    def make_room(self) -> bool:
+        """Delete what is left of samples that were given up; whether there was any."""
+        journal = self._folder.path / (SAMPLES + JOURNAL)
+        there = self.samples is None and journal.exists()
+        if there:
+            journal.unlink(missing_ok=True)
+        return there
+
     def _start_interval(self, utc_ns: int) -> None:
         assert self._intervals is not None
         begin_ns = utc_ns if self._interval_from_ns is None else self._interval_from_ns
@@ -145,7 +154,7 @@ class Recorder:
         if samples is not None:
             with contextlib.suppress(SourceError):
                 samples.close()
-            samples.path.unlink(missing_ok=True)
+            samples.path.unlink(missing_ok=True)  # with what it held: room for the summary
 
     def _put_line(self, line: str) -> None:
         if self._lines is None:
@@ -159,9 +168,18 @@ class Recorder:
 
     def _put_summary(self, text: str) -> None:
         try:
-            self._folder.put(SUMMARY, text)
+            self.put_summary(text)
         except SourceError as error:
             self._fail(str(error))
+
+    def put_summary(self, text: str) -> None:
+        """Write the summary, if need be in place of samples that were given up. Raises SourceError."""
+        try:
+            self._folder.put(SUMMARY, text)
+        except SourceError:
+            if not self.make_room():
+                raise
+            self._folder.put(SUMMARY, text)
 
     def _fail(self, reason: str) -> None:
         if reason not in self.failures:
