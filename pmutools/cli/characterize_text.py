@@ -16,6 +16,7 @@ _HEAD = (
     *("stream", "rate", "received", "expected", "loss", "delay p50", "p99", "± (ms)", "PDV p99"),
     *("jitter", "late", "dup", "reord"),
 )
+_CORRUPT = "bad CHK"
 Stream = Mapping[str, Any]
 
 
@@ -31,9 +32,12 @@ def told(
         yield "a recording does not say how good its clock was: delays hold its offset, differences of delays do not"
     yield ""
     shown = streams if all_of_them else worst(streams)
-    rows = [_HEAD, *map(_row, shown)]
+    every = [*shown]
     if len(streams) > 1:
-        rows.append(_row(summary["all"] | {"name": f"all {len(streams)}", "rate_hz": None, "uncertainty_ms": None}))
+        every.append(summary["all"] | {"name": f"all {len(streams)}", "rate_hz": None, "uncertainty_ms": None})
+    rows = [_HEAD, *map(_row, every)]
+    if summary["all"]["corrupt"]:  # seldom, and never to be overlooked
+        rows = [(*rows[0], _CORRUPT), *((*row, str(of["corrupt"])) for row, of in zip(rows[1:], every, strict=True))]
     yield from _table(rows)
     if len(shown) < len(streams):
         yield f"({len(streams) - len(shown)} more streams that fare better; -v shows all, summary.json holds all)"

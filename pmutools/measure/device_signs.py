@@ -11,6 +11,7 @@ FROZEN_FRAMES = 10
 """So many frames in a row with one stamp are no copies any more ..."""
 FROZEN_PERIODS = 5
 """... where they come over so many periods."""
+CORRUPT_SHARE = 0.001
 STOPPED_NS, STOPPED_PERIODS = 3 * NS, 30
 NO_TIME_BASE = 0xFFFFFF
 """All bits of TIME_BASE: a default, more likely than a clock of 16.8 MHz."""
@@ -31,6 +32,18 @@ def _silent(scene: Scene) -> str | None:
     return (
         f"not a single frame came{where}: is the sender on, and sending to this address and port? "
         "A device answers to its own IDCODE only"
+    )
+
+
+def _corrupt(scene: Scene) -> str | None:
+    counts = scene.result.counts
+    corrupt, frames = counts.events.corrupt, counts.slots.frames
+    if not frames or corrupt < CORRUPT_SHARE * (frames + corrupt):
+        return None
+    return (
+        f"{corrupt} frames ({corrupt / (frames + corrupt):.2%}) have a wrong CHK and are taken for lost: the sender "
+        "computes it wrongly, or something between (a serial link, a converter, a gateway) spoils bytes; UDP and TCP "
+        "find what the network itself does"
     )
 
 
@@ -230,6 +243,7 @@ ROWS: tuple[Row, ...] = (
     Row("silent", "no frame at all", _silent),
     Row("stopped", "nothing new for 3 s and 30 periods at the end", _stopped),
     Row("frozen-stamp", "10 or more frames in a row with the same stamp, over 5 periods or more", _frozen),
+    Row("corrupt", "0.1 % or more of the frames have a wrong CHK", _corrupt),
     Row("unexpected-rate", "another rate than the initialisation file's", _unwanted_rate),
     Row("config-changed", "another configuration while it ran", _changed),
     Row("stale-frames", "stamps far from those around them", _stale),

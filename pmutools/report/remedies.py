@@ -19,6 +19,7 @@ REMEDIES = {
     "pauses": "look into the sender's and the network's logs at that time",
     "periodic-delay": "look for what runs at this period: polling, schedulers, resampling concentrators",
     "stale-frames": "none is needed if they come at the start only; else look for what stores frames on the way",
+    "corrupt": "find by captures on both sides what spoils the frames: the sender, a serial line, a gateway",
     "stopped": "look to the sender and its link; the log says when it fell silent",
     "frozen-stamp": "restart the sender, and look to its source of time; use none of these values",
     "rate-mismatch": "make DATA_RATE of the configuration and the device's setting agree",

@@ -391,6 +391,7 @@ def test_damaged_frames_are_counted_and_are_exit_code_3(tmp_path: Path) -> None:
     (found,) = told["streams"]
     assert (found["corrupt"], found["lost"], told["all"]["corrupt"]) == (4, 4, 4)
     assert "bytes skipped: bad-chk" in result.err
+    assert "bad CHK" in result.out and "have a wrong CHK" in result.out
 
 
 def test_a_capture_that_is_cut_is_told_and_is_exit_code_3(tmp_path: Path) -> None:

@@ -231,6 +231,7 @@ SICK: dict[str, tuple[Scene, str]] = {
         Scene(stream(600, end_ns=START_NS + 20 * NS), clock()),
         "N1 stopped 10.0 s before the end, and",
     ),
+    "corrupt": (Scene(with_events(corrupt=600), clock()), "600 frames (4.76%)"),
     "frozen-stamp": (Scene(frozen(3000), clock()), "3000 frames in a row over 50.0 s"),
     "frozen-stamp for a while": (Scene(frozen(120, 1000), clock()), "120 frames in a row over 2.0 s"),
     "unexpected-rate": (
@@ -317,6 +318,7 @@ def test_every_row_has_a_case() -> None:
         ("pauses", Scene(dropped(300), clock())),
         ("stopped", Scene(stream(600, end_ns=START_NS + 12 * NS), clock())),
         ("stopped", Scene(frozen(3000), clock())),
+        ("corrupt", Scene(with_events(corrupt=5), clock())),
         ("frozen-stamp", Scene(frozen(4, 1000), clock())),
         ("frozen-stamp", Scene(slots(np.sort(np.append(np.arange(COUNT), [500] * 20))), clock())),
         ("pauses", Scene(frozen(120, 1000), clock())),
