@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pmutools.flow import StampSource
+from pmutools.measure.clock_signs import is_off
 from pmutools.measure.delay import BURST_SHARE
 from pmutools.measure.device_signs import is_frozen
 from pmutools.measure.scene import ENOUGH, Row, Scene, ms_text, span_text
@@ -171,7 +172,7 @@ def _late(scene: Scene) -> str | None:
     if delays.delay.count < ENOUGH or delays.late < 0.001 * delays.delay.count:
         return None
     most = delays.delay.quantile_ns(0.999) or 0.0
-    if most > 10 * NS or scene.result.clock_steps or scene.leaps:
+    if most > 10 * NS or scene.result.clock_steps or scene.leaps or is_off(scene):
         return None  # a clock's error, told elsewhere
     return (
         f"{delays.late / delays.delay.count:.2%} of the frames came after the concentrator's wait of "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pmutools.c37118.constants import Stat, TimeQuality
 from pmutools.measure.clockquality import TAI_LESS_UTC_S
 from pmutools.measure.delay import SECOND_WITHIN_NS
@@ -11,6 +13,8 @@ from pmutools.measure.scene import Row, Scene, ms_text, span_text
 from pmutools.timebase import NS, format_utc
 
 GPS_LESS_UTC_S = 18
+USUAL_NS = 200 * NS_PER_MS
+"""What a delay may be beside a clock's whole seconds."""
 SMEAR_PPM = 11.6
 """Of a leap second that is smeared over a day."""
 
@@ -64,6 +68,40 @@ def _locked_but_off(scene: Scene) -> str | None:
         f"{'behind' if middle > 0 else 'ahead of'} the "
         "receiver's clock: the sender's time quality means nothing, or the receiver's date is wrong"
     )
+
+
+def _clock_off(scene: Scene) -> str | None:
+    """As of :func:`_locked_but_off`, of a sender that owns up to it."""
+    middle = scene.middle_ns
+    if middle is None or abs(middle) < 5 * NS or scene.locked_share >= 0.5 or _scale(scene):
+        return None
+    off = f"{abs(middle) / NS / 3600:.2f} h" if abs(middle) >= 3600 * NS else span_text(abs(middle))
+    return (
+        f"the sender's clock is {off} {'behind' if middle > 0 else 'ahead'}; it says itself that it is not "
+        "synchronised: its delays are its clock's error, and no wait of a concentrator helps"
+    )
+
+
+def _whole_second(scene: Scene) -> str | None:
+    """A steady delay of whole seconds and a usual rest; below zero it can be nothing but a clock."""
+    delays, middle = scene.result.counts.delays.delay, scene.middle_ns
+    if middle is None or delays.min_ns is None or scene.leaps or scene.result.clock_steps or _scale(scene):
+        return None
+    seconds = math.floor(middle / NS + SECOND_WITHIN_NS / NS)
+    rest, least = middle - seconds * NS, delays.min_ns - seconds * NS
+    if not 1 <= abs(seconds) < 5 or rest > USUAL_NS or least < -SECOND_WITHIN_NS:
+        return None
+    way = "ahead of" if seconds < 0 else "behind"
+    besides = "" if seconds < 0 else ", unless a concentrator waits so long"
+    return (
+        f"the delay is {middle / NS:.3f} s, a whole number of seconds ({seconds:+d}) and {ms_text(rest)}: the sender's "
+        f"clock is {abs(seconds)} s {way} the receiver's, as where one of them missed a leap second{besides}"
+    )
+
+
+def is_off(scene: Scene) -> bool:
+    """Whether delays are a clock's error, so that a longer wait is no remedy."""
+    return any(test(scene) for test in (_scale, _locked_but_off, _clock_off, _whole_second))
 
 
 def _unsynchronised(scene: Scene) -> str | None:
@@ -160,6 +198,8 @@ ROWS: tuple[Row, ...] = (
     Row("negative-delays", "delays below zero", _negative),
     Row("tai-utc", "median delay of ±37 s or ±18 s", _scale),
     Row("locked-but-off", "MSG_TQ 0 on stamps 5 s or more from the receiver's clock", _locked_but_off),
+    Row("clock-off", "stamps 5 s or more from the receiver's clock, not synchronised by their own word", _clock_off),
+    Row("whole-second", "a median delay of 1 to 4 whole seconds, and up to 200 ms", _whole_second),
     Row("unsynchronised", "STAT or MSG_TQ says not synchronised, data called valid", _unsynchronised),
     Row("leap-second", "delays that jump by 1 s, or stamps that come twice under leap flags", _leap),
     Row("sender-clock-step", "stamps jump by 0.9 s and 10 periods or more while frames keep coming", _set),

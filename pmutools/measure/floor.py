@@ -51,15 +51,32 @@ class FloorCourse:
     least_ns: Ints
 
     def skew(self) -> Skew | None:
-        """The line of least squares; None for fewer than :data:`_ENOUGH` points."""
+        """The line of least squares; None for fewer than :data:`_ENOUGH` points.
+
+        The first stretch and the last are left out: they begin and end in the middle, and the least of a few frames
+        is more than that of many.
+        """
         if len(self.start_ns) < _ENOUGH:
             return None
-        seconds = (self.start_ns - self.start_ns[0]) / NS
-        off = (self.least_ns - self.least_ns[0]).astype(np.float64)
+        start_ns, least_ns = self.start_ns[1:-1], self.least_ns[1:-1]
+        seconds = (start_ns - start_ns[0]) / NS
+        off = (least_ns - least_ns[0]).astype(np.float64)
         seconds_off = seconds - seconds.mean()
         slope = float(seconds_off @ (off - off.mean()) / (seconds_off @ seconds_off))
         residual = off - off.mean() - slope * seconds_off
         return Skew(slope / 1000, float(seconds[-1]), float(residual.std()))
+
+    def drift(self) -> Skew | None:
+        """The skew where a line is what the floor is like: None where a step explains it better, or where the slope's
+        standard error is above 1 ppm and a fifth of it.
+        """
+        skew, step = self.skew(), self.step()
+        if skew is None or not skew.span_s:
+            return None
+        if step is not None and abs(step.change_ns) >= 6 * step.noise_ns and 2 * step.noise_ns <= skew.residual_ns:
+            return None
+        error_ppm = skew.residual_ns / 1000 / skew.span_s * math.sqrt(12 / (len(self.start_ns) - 2))
+        return None if error_ppm > max(1.0, abs(skew.ppm) / 5) else skew
 
     def step(self) -> Step | None:
         """The split into two levels that leaves the least spread, each of three points or more."""

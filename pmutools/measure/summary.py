@@ -99,7 +99,8 @@ def stream_summary(
     locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
     fitted_to, of = typical(counts.delays)
     fitted = best_fit(fitted_to) if fit else None
-    skew, peak = result.floor.skew(), counts.delays.evenness.peak(result.period_ns)
+    skew = None if result.clock_steps else result.course.drift()
+    peak = counts.delays.evenness.peak(result.period_ns)
     names = [station.name for station in result.config.stations]
     diagnoses = diagnose(Scene(result, clock, others))
     rows = budget(counts.delays.delay, counts.delays.pdv, counts.windows.to_tick, departures=departures)

@@ -7,6 +7,8 @@ REMEDIES = {
     "negative-delays": "compare both clocks with UTC: the receiver's sources of time, lock and antenna at the sender",
     "tai-utc": "set the UTC offset where the stamps are made: the PMU's clock settings, or phc2sys -O at the receiver",
     "locked-but-off": "check date and GPS week of the sender's clock, and the receiver's date; do not trust MSG_TQ",
+    "clock-off": "set the sender's clock: date, time zone, source of time; it must run on UTC",
+    "whole-second": "compare both clocks with UTC, and their leap seconds",
     "unsynchronised": "look to the sender's clock: its antenna, its cable, its holdover",
     "leap-second": "measure again away from the leap second",
     "sender-clock-step": "look why the sender's clock was set: its antenna, its source of time; judge both parts apart",

@@ -16,6 +16,7 @@ from pmutools.measure.clockquality import ClockLog, ClockQuality, KernelClock
 from pmutools.measure.diagnoses import ROWS, diagnose
 from pmutools.measure.scene import Peer, Scene, peers_of
 from pmutools.measure.stream import Identity, StreamMeter, StreamResult
+from pmutools.measure.summary import summary
 from pmutools.timebase import NS
 
 RNG = np.random.default_rng(11)
@@ -161,6 +162,9 @@ SICK: dict[str, tuple[Scene, str]] = {
     "tai-utc gps": (Scene(stream(delay_ms=-18_000 + 44.0), clock()), "GPS time is 18 s"),
     "locked-but-off": (Scene(stream(delay_ms=4.8 * 86_400_000), clock()), "4.8 days behind"),
     "locked-but-off ahead": (Scene(stream(delay_ms=-29_000), clock()), "29.0 s ahead"),
+    "clock-off": (Scene(stream(delay_ms=-8.04 * 3_600_000, time_quality=0xF), clock()), "8.04 h ahead; it says itself"),
+    "whole-second": (Scene(stream(delay_ms=-1000 + 21), clock()), "is 1 s ahead of the receiver's"),
+    "whole-second behind": (Scene(stream(delay_ms=1000 + 21), clock()), "is 1 s behind the receiver's"),
     "unsynchronised": (Scene(stream(stat=0x21F0, time_quality=0xF), clock()), "100%"),
     "leap-second": (Scene(leapt(), clock()), "2 time(s)"),
     "leap-second repeated": (
@@ -318,6 +322,13 @@ def test_every_row_has_a_case() -> None:
         ("pauses", Scene(dropped(300), clock())),
         ("stopped", Scene(stream(600, end_ns=START_NS + 12 * NS), clock())),
         ("stopped", Scene(frozen(3000), clock())),
+        ("clock-off", Scene(stream(time_quality=0xF), clock())),
+        ("clock-off", SICK["locked-but-off"][0]),
+        ("whole-second", Scene(stream(delay_ms=600.0), clock())),
+        ("whole-second", Scene(stream(delay_ms=-100.0), clock())),
+        ("whole-second", Scene(stream(delay_ms=20 + noise(mean_ms=1500.0)), clock())),
+        ("late-frames", Scene(stream(delay_ms=1021.0), clock())),
+        ("late-frames", Scene(stream(delay_ms=6021.0, time_quality=0xF), clock())),
         ("corrupt", Scene(with_events(corrupt=5), clock())),
         ("frozen-stamp", Scene(frozen(4, 1000), clock())),
         ("frozen-stamp", Scene(slots(np.sort(np.append(np.arange(COUNT), [500] * 20))), clock())),
@@ -334,3 +345,18 @@ def test_every_row_has_a_case() -> None:
 )
 def test_not_made_of_what_is_only_near(case: str, near: Scene) -> None:
     assert case not in {diagnosis.id for diagnosis in diagnose(near)}
+
+
+def skew_ppm(result: StreamResult) -> float | None:
+    (told,) = summary([result], clock(), fits=False)["streams"]
+    found: float | None = told["skew_ppm"]
+    return found
+
+
+def test_skew_is_a_line_s_and_nothing_else_s() -> None:
+    count = 18_000 + 3  # ends with a few frames of a stretch of their own
+    assert skew_ppm(stream(count, delay_ms=44 + np.arange(count) / 60 * 0.05)) == pytest.approx(50, abs=0.1)
+    ragged = np.where(np.arange(count) >= 18_000, 60.0, 44.0)
+    assert skew_ppm(stream(count, delay_ms=ragged)) == pytest.approx(0, abs=0.1)
+    for result in (stepped(5), stepped(-1), SICK["latency-step"][0].result):
+        assert skew_ppm(result) is None
