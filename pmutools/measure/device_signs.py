@@ -75,7 +75,7 @@ def _stopped(scene: Scene) -> str | None:
     came = result.last_arrival_ns != result.last_new_ns
     what = "what came after that was copies or old stamps" if came else "nothing came after that"
     return (
-        f"{result.identity.name} stopped {span_text(result.silent_ns)} before the end, and {what}: the sender, its "
+        f"it stopped {span_text(result.silent_ns)} before the end, and {what}: the sender, its "
         "link or its connection is down; it is not counted as loss"
     )
 

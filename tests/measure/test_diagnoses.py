@@ -233,7 +233,7 @@ SICK: dict[str, tuple[Scene, str]] = {
     "silent corrupt": (Scene(nothing(corrupt=7), clock()), "7 frames with a wrong CHK"),
     "stopped": (
         Scene(stream(600, end_ns=START_NS + 20 * NS), clock()),
-        "N1 stopped 10.0 s before the end, and",
+        "it stopped 10.0 s before the end, and",
     ),
     "corrupt": (Scene(with_events(corrupt=600), clock()), "600 frames (4.76%)"),
     "frozen-stamp": (Scene(frozen(3000), clock()), "3000 frames in a row over 50.0 s"),
