@@ -12,9 +12,10 @@ from functools import cached_property
 
 from dcon.core.params import Params
 from dcon.core.pmu import end_run
+from dcon.core.rows import CORE
 from dcon.core.state import State, initial_state
 from dcon.core.step import step
-from dcon.core.values import Event, Inputs, Mode, Order, Record, Sample
+from dcon.core.values import NOTHING, Event, Inputs, Mode, Order, Record, Sample, Surroundings
 from dcon.frontend import Binding, Reading, bind
 from pmutools.c37118 import Frame, StreamConfig
 from pmutools.errors import SettingsError, WireError
@@ -28,6 +29,8 @@ class Tick:
 
     record: Record
     readings: tuple[Reading, ...]
+    surroundings: Surroundings = NOTHING
+    """What it was told, with the frames that it could not read."""
 
     @cached_property
     def frames(self) -> tuple[PmuFrame, ...]:
@@ -44,6 +47,7 @@ class Engine:
         """``sites`` in the order of ``params.pmus``; ``verified`` credits every instance with 20 s of good data."""
         self.params = params
         self.state: State = initial_state(params, mode=mode, verified=verified)
+        _ = params.waveform, CORE.tables(params)  # worked out before a tick needs them
         self.sites = tuple(sites)
         self._index = {site.name: number for number, site in enumerate(self.sites)}
         self.bindings: dict[str, Binding] = {}
@@ -92,8 +96,18 @@ class Engine:
         pmus = self.state.pmus
         self.state = self.state._replace(pmus=(*pmus[:index], end_run(pmus[index]), *pmus[index + 1 :]))
 
-    def tick(self, frames: Mapping[str, Iterable[Frame]], orders: tuple[Order, ...], now_ns: int) -> Tick:
-        """Run one tick at ``now_ns`` with the data frames of each PMU that arrived since the last, in order."""
+    def tick(
+        self,
+        frames: Mapping[str, Iterable[Frame]],
+        orders: tuple[Order, ...],
+        now_ns: int,
+        surroundings: Surroundings = NOTHING,
+    ) -> Tick:
+        """Run one tick at ``now_ns`` with the data frames of each PMU that arrived since the last, in order.
+
+        ``surroundings`` is what the tick is told besides; frames that cannot be read are added to it.
+        """
+        lost = [0] * len(self.sites)
         samples: list[list[Sample]] = [[] for _ in self.sites]
         readings: list[Reading] = []
         for name, arrived in frames.items():
@@ -102,15 +116,19 @@ class Engine:
                 read = None if binding is None else _read(binding, frame)
                 if read is None:
                     self.unread[name] = self.unread.get(name, 0) + 1
+                    if name in self._index:
+                        lost[self._index[name]] += 1
                 else:
                     samples[self._index[name]].append(read.sample)
                     readings.append(read)
-        inputs = Inputs(tuple(map(tuple, samples)), orders)
+        if any(lost):
+            surroundings = surroundings._replace(unread=tuple(lost))
+        inputs = Inputs(tuple(map(tuple, samples)), orders, surroundings)
         self.state, record = step(self.params, self.state, inputs, now_ns)
         if self._notes:
             record = record._replace(events=(*self._notes, *record.events))
             self._notes = []
-        return Tick(record, tuple(readings))
+        return Tick(record, tuple(readings), surroundings)
 
 
 def _read(binding: Binding, frame: Frame) -> Reading | None:

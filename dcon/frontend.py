@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from dcon.core.sequence import positive_sequence
+from dcon.core.sequence import sequences
 from dcon.core.values import Sample
 from pmutools.c37118 import Frame, StreamConfig
 from pmutools.c37118.frames import Data, unpack_data
 from pmutools.c37118.layout import Layout, layout_of
 from pmutools.errors import SettingsError
 from pmutools.schema.pmu_log import PmuFrame, pmu_frame
+
+_ABSENT = complex(math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +34,16 @@ class Binding:
             return None
         data = unpack_data(frame.data, self.config, self.layout)
         time_ns, arrival_ns = data.time_ns, frame.arrival_ns
+        v1, v2 = self.voltages(data)
         sample = Sample(
             time_ns,
             time_ns if arrival_ns is None else arrival_ns,
-            self.v1(data),
+            v1,
             data.frequency(self.station),
             data.stat(self.station),
             data.time_quality,
             self.layout.time_base,
+            v2,
         )
         return Reading(self, frame, data, sample)
 
@@ -50,11 +55,11 @@ class Binding:
             *_meaning(other.layout),
         )
 
-    def v1(self, data: Data) -> complex:
-        """Positive-sequence voltage, V RMS."""
+    def voltages(self, data: Data) -> tuple[complex, complex]:
+        """Positive- and negative-sequence voltage, V RMS; the latter NaN where the phases are not given."""
         if len(self.voltage) == 1:
-            return data.phasor(self.voltage[0])
-        return positive_sequence(*map(data.phasor, self.voltage))
+            return data.phasor(self.voltage[0]), _ABSENT
+        return sequences(*map(data.phasor, self.voltage))
 
 
 class Reading(NamedTuple):

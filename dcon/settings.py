@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from dcon.core.params import Pair, Params, PmuParams, Thresholds
+from dcon.core.params import Line, Pair, Params, PmuParams, Required
+from dcon.core.probe import Probing
+from dcon.core.thresholds import Thresholds
+from dcon.limiter import LIMIT_MW
 from pmutools.errors import SettingsError
 from pmutools.net.endpoint import Endpoint, Scheme
-from pmutools.parsers import Parser, boolean, integer, number, parsed_by, suggestion, words
+from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
 from pmutools.sites import Site, endpoint, read_ini, sites_of
 
 PARAMS = {item.name: item for item in fields(Params)}
-FROM_SITES = frozenset(("pmus", "instances", "thresholds", "rate_hz"))
-"""Fields of Params that follow from the PMUs' sections: no keys of ``[controller]``."""
+ELSEWHERE = frozenset(("pmus", "instances", "rate_hz", "thresholds", "line", "required", "probing"))
+"""Fields of Params that other sections fill: no keys of ``[controller]``."""
 _RATE = PARAMS["rate_hz"].metadata
 RATE_HZ = 60
 """Of a PMU whose section names none."""
+PROBE_BYTES = 16 << 20
+"""Largest file of a probing signal."""
+T = TypeVar("T")
 
 
 def _destination(text: str) -> Endpoint:
@@ -45,6 +53,24 @@ class Platform:
     """Ticks are this long after each 1/60 s of UTC."""
     fifo: bool = field(default=True, metadata=parsed_by(boolean))
     """Ask for the FIFO scheduling policy; without the privilege the loop runs on, with a warning."""
+    gps_required: bool = field(default=False, metadata=parsed_by(boolean))
+    """The GPS lock of the controller's clock must be known: without it no arming, and a loss disarms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watchdog:
+    """``[watchdog]``."""
+
+    required: bool = field(default=False, metadata=parsed_by(boolean))
+    """Watchdog and emergency stop must be known to be healthy and released: without them no arming, a loss trips."""
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """``[server]``."""
+
+    required: bool = field(default=False, metadata=parsed_by(boolean))
+    """The server must be heard: without it no arming; a loss warns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +78,6 @@ class Log:
     """``[log]``."""
 
     path: str = field(default="session.mcap", metadata=parsed_by(str))
-
-
-@dataclass(frozen=True, slots=True)
-class Reserved:
-    """``[watchdog] [server] [pdci]``: known sections that have no key yet."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +88,13 @@ class Settings:
     sites: tuple[Site, ...]
     output: Output = Output()
     platform: Platform = Platform()
+    watchdog: Watchdog = Watchdog()
+    server: Server = Server()
     log: Log = Log()
     text: str = ""
     """The file itself, for the log."""
+    probe_file: bytes = b""
+    """What ``file`` of ``[probing]`` names, for the log."""
 
 
 def load(path: str | Path) -> Settings:
@@ -77,26 +102,73 @@ def load(path: str | Path) -> Settings:
     return from_ini(*read_ini(path))
 
 
-def parse(text: str, source: str, changes: tuple[str, ...] = ()) -> Settings:
-    """Settings of an INI text; ``changes`` are ``SECTION.KEY=VALUE`` laid over it."""
+def parse(text: str, source: str, changes: tuple[str, ...] = (), *, probe_file: bytes | None = None) -> Settings:
+    """Settings of an INI text; ``changes`` are ``SECTION.KEY=VALUE`` laid over it.
+
+    ``probe_file`` is what the file of ``[probing]`` held; it is read where that is None.
+    """
     ini = parse_ini(text, source, defaults_for="pmu")
     for change in changes:
         ini = ini.changed(change)
-    return from_ini(ini, text)
+    return from_ini(ini, text, probe_file)
 
 
-def from_ini(ini: Ini, text: str = "") -> Settings:
+def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Settings:
     sites = sites_of(ini)
-    for name in ("watchdog", "server", "pdci"):
-        fill(Reserved, ini.section(name))
+    platform = fill(Platform, ini.section("platform"))
+    watchdog, server = fill(Watchdog, ini.section("watchdog")), fill(Server, ini.section("server"))
+    required = Required(platform.gps_required, watchdog.required, server.required)
+    probing, probe_file = probing_of(ini.section("probing"), probe_file)
     return Settings(
-        _params(ini, sites),
+        _params(ini, sites, required, probing),
         sites,
         fill(Output, ini.section("output")),
-        fill(Platform, ini.section("platform")),
+        platform,
+        watchdog,
+        server,
         fill(Log, ini.section("log")),
         text,
+        probe_file,
     )
+
+
+def probing_of(section: Section, data: bytes | None = None) -> tuple[Probing, bytes]:
+    """``[probing]`` and what its file holds: ``data``, read unless given."""
+    values = _numbers(Probing, section, skip=("samples",))
+    if values.get("kind") == "file" and (entry := section.entries.get("file")) is not None:
+        if data is None:
+            data = _read(entry)
+        values["samples"] = _column(entry, data, values.get("column", "probe_mw"))
+    try:
+        return Probing(**values), data or b""
+    except SettingsError as error:
+        raise section.where.error(error) from None
+
+
+def _read(entry: Entry) -> bytes:
+    try:
+        with Path(entry.text).open("rb") as file:
+            data = file.read(PROBE_BYTES + 1)
+    except OSError as error:
+        raise entry.where.error(f"{entry.text}: {error.strerror}") from None
+    if len(data) > PROBE_BYTES:
+        raise entry.where.error(f"{entry.text}: more than {PROBE_BYTES:,} bytes; a signal is an hour at most")
+    return data
+
+
+def _column(entry: Entry, data: bytes, column: str) -> tuple[float, ...]:
+    """The signal in MW, one value a tick."""
+    rows = csv.DictReader(io.StringIO(data.decode(errors="replace")))
+    if column not in (rows.fieldnames or ()):
+        there = ", ".join(rows.fieldnames or ()) or "none"
+        raise entry.where.error(f"{entry.text}: no column {column!r}; there are {there}: set column")
+    samples = []
+    for row in rows:
+        try:
+            samples.append(number(-LIMIT_MW, LIMIT_MW)(row[column] or ""))
+        except ValueError as error:
+            raise entry.where.error(f"{entry.text}:{rows.line_num}: {error}") from None
+    return tuple(samples)
 
 
 def rate_of(site: Site) -> int:
@@ -104,7 +176,7 @@ def rate_of(site: Site) -> int:
     return RATE_HZ if site.rate is None else site.rate
 
 
-def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
+def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Probing) -> Params:
     for section, site in zip(ini.family("pmu"), sites, strict=True):
         if entry := section.entries.get("rate"):
             entry.read(integer(_RATE["low"], _RATE["high"]))
@@ -116,8 +188,9 @@ def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
     section = ini.section("controller")
     entries = dict(section.entries)
     priority = entries.pop("priority", None)
-    given = _numbers(Params, Section(section.name, section.where, entries), skip=FROM_SITES)
-    thresholds = Thresholds(**_numbers(Thresholds, ini.section("supervisor")))
+    given = _numbers(Params, Section(section.name, section.where, entries), skip=ELSEWHERE)
+    thresholds = _filled(Thresholds, ini.section("supervisor"))
+    line = _filled(Line, ini.section("pdci"))
     instances = _every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
@@ -128,6 +201,9 @@ def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
             pmus=tuple(PmuParams(site.name, site.nominal_kv) for site in sites),
             instances=instances,
             thresholds=thresholds,
+            line=line,
+            required=required,
+            probing=probing,
             rate_hz=rate_of(sites[0]),
             **given,
         )
@@ -135,8 +211,17 @@ def _params(ini: Ini, sites: tuple[Site, ...]) -> Params:
         raise section.where.error(error) from None
 
 
+def _filled(cls: type[T], section: Section) -> T:
+    """A dataclass of a section; what its values are not together is said of the section."""
+    values = _numbers(cls, section)
+    try:
+        return cls(**values)
+    except SettingsError as error:
+        raise section.where.error(error) from None
+
+
 def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[str, Any]:
-    """Values of a section for a dataclass whose fields carry bounds as metadata; booleans and whole numbers too."""
+    """Values of a section for a dataclass whose fields carry bounds or choices as metadata, by the defaults' types."""
     known = {item.name: item for item in fields(cls) if item.name not in skip}
     values: dict[str, Any] = {}
     for key, entry in section.entries.items():
@@ -146,6 +231,8 @@ def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[st
         parse: Parser[Any]
         if isinstance(item.default, bool):
             parse = boolean
+        elif isinstance(item.default, str):
+            parse = choice(*item.metadata["choices"]) if "choices" in item.metadata else str
         elif isinstance(item.default, int):
             parse = integer(item.metadata["low"], item.metadata["high"])
         else:
@@ -190,13 +277,18 @@ def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
     sections: tuple[tuple[str, Any], ...] = (
         ("controller", params),
         ("supervisor", params.thresholds),
+        ("probing", params.probing),
+        ("pdci", params.line),
         ("platform", settings.platform),
+        ("watchdog", settings.watchdog),
+        ("server", settings.server),
         ("output", settings.output),
         ("log", settings.log),
     )
     for section, values in sections:
+        left_out = {"controller": ELSEWHERE, "probing": ("samples",)}.get(section, ())
         for item in fields(values):
-            if item.name not in FROM_SITES:
+            if item.name not in left_out:
                 value = _shown(getattr(values, item.name), item.metadata.get("unit", ""))
                 rows.append((section, item.name, value, item.metadata.get("source", "")))
         if section == "controller":

@@ -16,7 +16,7 @@ from pmutools.parsers import choice, integer, number, parsed_by, words
 from pmutools.settings import Ini, Section, fill, parse_ini
 
 SIDES = ("north", "south", "none")
-SECTIONS = ("controller", "supervisor", "platform", "watchdog", "server", "output", "pdci", "log")
+SECTIONS = ("controller", "supervisor", "probing", "platform", "watchdog", "server", "output", "pdci", "log")
 """Sections that belong to the controller."""
 RATES = (1, 240)
 """Reporting rates that a site may have, frames per second."""

@@ -1,20 +1,25 @@
-"""The seam for supervision: a check is a row of a table, and a supervisor is the tables that one ``step`` uses.
+"""What a check is: a row of a table, and a supervisor is the tables that one ``step`` uses.
 
-A test looks at values and answers whether its check is up; what follows is the row's ``action``, decided here and
-nowhere else. The supervisor that grows rows, timers and acknowledgement passes its own tables to ``step``.
+A row judges one number. It is up while the number is outside the row's bounds, NaN included, and has been so for the
+row's time; what follows is the row's ``action``, decided here and nowhere else. None is "not judged": the check is
+down and its time starts again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
+from dcon.core.feedback import Feedback
 from dcon.core.params import Params, PmuParams
-from dcon.core.state import Instance, Pmu
-from dcon.core.values import Sample, SystemState
+from dcon.core.quick import Limits, limits_of
+from dcon.core.state import Evidence, Instance, Pmu
+from dcon.core.values import Sample, Surroundings, SystemState
 
 
 class Scope(StrEnum):
@@ -35,37 +40,143 @@ class Action(StrEnum):
     """Ramps the command to 0."""
     TRIP = "trip"
     """0 MW at once, FAULT."""
+    ESTOP = "estop"
+    """0 MW at once, ESTOP."""
+
+
+LATCHING = (Action.DISARM, Action.TRIP, Action.ESTOP)
+"""Actions that, once taken, ask for an acknowledgement before the controller may be armed again."""
+
+
+class PairView(NamedTuple):
+    """What an instance check sees: both PMUs have a frequency."""
+
+    north: Pmu
+    south: Pmu
+    delta_f_mhz: float
+    median_mhz: float | None
+    """Of Δf over the instances that are READY; None where they are fewer than three."""
+    now_ns: int
 
 
 class SystemView(NamedTuple):
-    """What a system check sees of a tick, before the command of that tick is formed."""
+    """What a system check sees of a tick, before its orders and its command."""
 
     state: SystemState
     ready: int
     """Instances that are READY or HELD."""
     active: Instance | None
+    angle_deg: float | None
+    """Of the active instance, north minus south, within ±180°; None without one."""
+    slipped: bool
+    """It went through ±180° since the last tick."""
+    overruns: int
+    """Ticks of the last second that were not done in time."""
+    feedback: Feedback
+    """The command without probing, up to the last tick."""
+    driven_mw: float
+    """Output of the last tick."""
+    surroundings: Surroundings
+    now_ns: int
 
 
-FrameTest = Callable[[Params, PmuParams, Pmu, Pmu, Sample], bool]
+FrameValue = Callable[[Params, PmuParams, Pmu, Pmu, Sample], float | None]
 """(params, pmu, memory before the frame, memory with it, the frame). A frame that disables is not used."""
-PmuTest = Callable[[Params, Pmu, int], bool]
+PmuValue = Callable[[Params, Pmu, int], float | None]
 """(params, pmu after the tick's frames, now_ns)."""
-InstanceTest = Callable[[Params, Pmu, Pmu, int], bool]
-"""(params, north, south, now_ns); both have a frequency."""
-SystemTest = Callable[[Params, SystemView], bool]
+PairValue = Callable[[Params, PairView], float | None]
+SystemValue = Callable[[Params, SystemView], float | None]
 
-T = TypeVar("T")
+V = TypeVar("V")
+Bound = float | str | Callable[[Params], float]
+"""A number, the name of a threshold, or what gives the number."""
 
 
-class Check(NamedTuple, Generic[T]):
-    """A row. ``test`` is None where the engine itself raises the check."""
+class Check(NamedTuple, Generic[V]):
+    """A row. ``value`` is None where the engine itself raises the check; its docstring says what it is."""
 
     name: str
     scope: Scope
     action: Action
-    test: T
+    value: V
     text: str
     """For the operator."""
+    high: Bound = 0.0
+    low: Bound = -math.inf
+    hold: str = ""
+    """Threshold that says for how long (``_s``, ``_frames``, ``_ticks``); "" is at once."""
+    unit: str = ""
+    """Of ``value``, where no threshold gives it."""
+
+
+class Judged(NamedTuple):
+    """A row made ready for one set of parameters."""
+
+    bit: int
+    value: Callable[..., float | None]
+    low: float
+    high: float
+    held: int
+    """Place among the counts of a table; -1 where the row acts at once."""
+    need: int
+    """Frames or ticks for which the condition must hold."""
+
+
+def bound(params: Params, given: Bound) -> float:
+    """The number that a bound stands for."""
+    if isinstance(given, str):
+        return float(getattr(params.thresholds, given))
+    return float(given(params)) if callable(given) else float(given)
+
+
+def needed(params: Params, hold: str, rate_hz: int) -> int:
+    """Frames or ticks, ``rate_hz`` of them in a second, that a row's time comes to."""
+    if not hold:
+        return 1
+    given = getattr(params.thresholds, hold)
+    return max(1, round(given * rate_hz) if hold.endswith("_s") else int(given))
+
+
+def judge(
+    rows: Sequence[Judged], held: tuple[int, ...], arguments: tuple[object, ...]
+) -> tuple[int, tuple[int, ...], Evidence]:
+    """(bits of the rows that are up, counts, what was found); ``()`` stands for counts that are all 0."""
+    raised = 0
+    counts: dict[int, int] = {}
+    found: Evidence = ()
+    for bit, value_of, low, high, at, need in rows:
+        value = value_of(*arguments)
+        if value is None or low <= value <= high:
+            continue
+        if at >= 0:
+            counts[at] = count = min(need, (held[at] if held else 0) + 1)
+            if count < need:
+                continue
+        raised |= bit
+        found += ((bit, value),)
+    if counts:
+        return raised, tuple(counts.get(at, 0) for at in range(1 + max(row.held for row in rows))), found
+    return raised, (), found
+
+
+class Tables(NamedTuple):
+    """A supervisor's rows, ready for one set of parameters."""
+
+    params: Params
+    frame: tuple[Judged, ...]
+    pmu: tuple[Judged, ...]
+    instance: tuple[Judged, ...]
+    system: tuple[tuple[Judged, ...], ...]
+    """Those to judge, by :func:`which`."""
+    limits: dict[int, tuple[float, float]]
+    """(low, high) by bit."""
+    quick: Limits | None
+    """For the uneventful case; None where the rows are not those that it knows."""
+
+
+def which(feedback: bool, told: bool) -> int:
+    """Place in ``Tables.system``: with the rows of the feedback command, with those of the surroundings."""
+    return feedback + 2 * told
 
 
 @dataclass(frozen=True)
@@ -73,25 +184,39 @@ class Supervisor:
     """The rows of every kind; bit k of ``Record.flags`` is the k-th row in the order of these fields."""
 
     engine: tuple[Check[None], ...]
-    frame: tuple[Check[FrameTest], ...]
-    pmu: tuple[Check[PmuTest], ...]
-    instance: tuple[Check[InstanceTest], ...]
-    system: tuple[Check[SystemTest], ...]
+    frame: tuple[Check[FrameValue], ...]
+    pmu: tuple[Check[PmuValue], ...]
+    instance: tuple[Check[PairValue], ...]
+    system: tuple[Check[SystemValue], ...]
+    feedback: tuple[Check[SystemValue], ...] = ()
+    """Judged in ACTIVE only."""
+    surroundings: tuple[Check[SystemValue], ...] = ()
+    """Judged where something is told, or required."""
+    known: tuple[Any, Any, Any] = ((), (), ())
+    """Tables of frames, PMUs and instances that :mod:`dcon.core.quick` passes where none of their rows is up."""
+    _ready: list[Tables] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if len(self.names) > 64 or len(set(self.names)) < len(self.names):
             raise ValueError("more than 64 checks, or two of one name")
 
     @cached_property
-    def rows(self) -> tuple[tuple[str, Scope, Action, str], ...]:
-        """(name, scope, action, text) of every check, in the order of their bits."""
-        tables = (self.engine, self.frame, self.pmu, self.instance, self.system)
-        return tuple((row.name, row.scope, row.action, row.text) for table in tables for row in table)
+    def rows(self) -> tuple[Check[Any], ...]:
+        """Every check, in the order of their bits."""
+        return (
+            *self.engine,
+            *self.frame,
+            *self.pmu,
+            *self.instance,
+            *self.system,
+            *self.feedback,
+            *self.surroundings,
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Name of each bit of ``Record.flags``, from bit 0."""
-        return tuple(name for name, *_ in self.rows)
+        return tuple(row.name for row in self.rows)
 
     @cached_property
     def bits(self) -> dict[str, int]:
@@ -99,7 +224,7 @@ class Supervisor:
 
     def mask(self, *actions: Action) -> int:
         """Bits of all checks with one of these actions."""
-        return sum(self.bits[name] for name, _, action, _ in self.rows if action in actions)
+        return sum(self.bits[row.name] for row in self.rows if row.action in actions)
 
     @cached_property
     def disabling(self) -> int:
@@ -114,26 +239,62 @@ class Supervisor:
         return self.mask(Action.TRIP)
 
     @cached_property
+    def stopping(self) -> int:
+        return self.mask(Action.ESTOP)
+
+    @cached_property
     def of_frames(self) -> int:
         """Bits that frames raise, and that stay as they are while none comes."""
-        of_ticks = {row.name for row in self.pmu}
-        return sum(self.bits[name] for name, scope, *_ in self.rows if scope is Scope.PMU and name not in of_ticks)
+        engine = sum(self.bits[row.name] for row in self.engine if row.scope is Scope.PMU)
+        return engine + sum(self.bits[row.name] for row in self.frame)
 
     @cached_property
-    def frame_tests(self) -> tuple[tuple[int, FrameTest], ...]:
-        return tuple((self.bits[row.name], row.test) for row in self.frame)
+    def of_commands(self) -> int:
+        """Bits that the forming of the command raises."""
+        return self.bits["command_invalid"] | self.bits["slew_limited"]
 
-    @cached_property
-    def pmu_tests(self) -> tuple[tuple[int, PmuTest], ...]:
-        return tuple((self.bits[row.name], row.test) for row in self.pmu)
+    def tables(self, params: Params) -> Tables:
+        """The rows for ``params``; those asked for last are kept."""
+        if not self._ready or self._ready[0].params is not params:
+            self._ready[:] = (self._made(params),)
+        return self._ready[0]
 
-    @cached_property
-    def instance_tests(self) -> tuple[tuple[int, InstanceTest], ...]:
-        return tuple((self.bits[row.name], row.test) for row in self.instance)
+    def _made(self, params: Params) -> Tables:
+        rate_hz, tick_hz = params.rate_hz, params.tick_hz
+        system = self._judged(params, (*self.system, *self.feedback, *self.surroundings), tick_hz)
+        plain, last = len(self.system), len(self.system) + len(self.feedback)
+        always, feedback, told = system[:plain], system[plain:last], system[last:]
+        return Tables(
+            params,
+            self._judged(params, self.frame, rate_hz),
+            self._judged(params, self.pmu, tick_hz),
+            self._judged(params, self.instance, tick_hz),
+            (always, always + feedback, always + told, always + feedback + told),
+            {
+                self.bits[row.name]: (bound(params, row.low), bound(params, row.high))
+                for row in self.rows
+                if row.value is not None
+            },
+            limits_of(params) if self._is_known else None,
+        )
 
-    @cached_property
-    def system_tests(self) -> tuple[tuple[int, SystemTest], ...]:
-        return tuple((self.bits[row.name], row.test) for row in self.system)
+    @property
+    def _is_known(self) -> bool:
+        return all(map(operator.is_, self.known, (self.frame, self.pmu, self.instance)))
+
+    def _judged(self, params: Params, rows: Iterable[Check[Any]], rate_hz: int) -> tuple[Judged, ...]:
+        places = iter(range(64))
+        return tuple(
+            Judged(
+                self.bits[row.name],
+                row.value,
+                bound(params, row.low),
+                bound(params, row.high),
+                next(places) if row.hold else -1,
+                needed(params, row.hold, rate_hz),
+            )
+            for row in rows
+        )
 
     def named(self, bits: int) -> list[str]:
         """Names of the set bits, lowest first."""

@@ -27,6 +27,11 @@ class Coefficients(NamedTuple):
     b: float
     rate_hz: float
 
+    @property
+    def low_pass(self) -> float:
+        """Gain of the low-pass in H(z): (1 + z⁻¹)² times this over the same denominator."""
+        return self.b * math.pi / self.rate_hz
+
 
 PAPER_60 = Coefficients(a1=1.55725978, a2=0.61839943, b=0.29192028, rate_hz=60)
 """As printed in section III. :func:`design` gives the same to 1e-8."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
-from dcon.core.checks import Supervisor
+from dcon.core.checks import PairView, Supervisor, Tables, judge
 from dcon.core.params import Pair, Params
+from dcon.core.quick import next_instances
 from dcon.core.state import Instance, Pmu
 from dcon.core.values import InstanceState
 
-_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time: there are many instances
 _S = InstanceState
-_INITIALISING: Final = InstanceState.INITIALISING  # looking a member up costs as much as comparing it
 TRANSITIONS: Final[dict[tuple[InstanceState, str], InstanceState]] = {
     (_S.DISABLED, "pair"): _S.INITIALISING,
     (_S.INITIALISING, "verified"): _S.READY,
@@ -45,43 +45,73 @@ def difference(north: Pmu, south: Pmu, align: bool) -> tuple[int, float] | None:
     return slot, (north.ring[back_north] - south.ring[back_south]) * 1e3
 
 
-def disable(last: Instance, reason: str, raised: int = 0) -> Instance:
+def disable(last: Instance, reason: str) -> Instance:
     """``last`` after a fault: whatever was verified is lost. A disabled instance keeps its first reason."""
     if last.state is InstanceState.DISABLED and last.reason and not last.verified:
-        return last._replace(raised=raised)
-    return Instance(reason=reason, raised=raised)
+        return last._replace(raised=0, held=(), evidence=())
+    return Instance(reason=reason)
+
+
+def median_mhz(last: Sequence[Instance], found: Sequence[tuple[int, float] | None]) -> float | None:
+    """Of Δf over the instances that were READY and still have one; None where they are fewer than three."""
+    known = sorted(new[1] for old, new in zip(last, found, strict=True) if new is not None and old.is_ready)
+    middle, odd = divmod(len(known), 2)
+    if len(known) < 3 or math.isnan(sum(known)):
+        return None
+    return known[middle] if odd else (known[middle - 1] + known[middle]) / 2
 
 
 def update(
-    params: Params, supervisor: Supervisor, pair: Pair, last: Instance, pmus: Sequence[Pmu], now_ns: int
+    params: Params, supervisor: Supervisor, tables: Tables, last: Sequence[Instance], pmus: Sequence[Pmu], now_ns: int
+) -> tuple[Instance, ...]:
+    """All instances after their PMUs' tick."""
+    if tables.quick is not None:
+        uneventful = next_instances(tables.quick, params.instances, last, pmus, supervisor.disabling, now_ns)
+        if uneventful is not None:
+            return uneventful
+    faulty = [bool(pmu.raised & supervisor.disabling) for pmu in pmus]
+    found = [
+        None if faulty[north] or faulty[south] else difference(pmus[north], pmus[south], params.align)
+        for north, south in params.instances
+    ]
+    middle = median_mhz(last, found)
+    after = []
+    for pair, old, new in zip(params.instances, last, found, strict=True):
+        if faulty[pair.north] or faulty[pair.south]:
+            after.append(disable(old, _faults(params, supervisor, pair, pmus)))
+        elif new is None:
+            after.append(old if old.state is InstanceState.DISABLED else disable(old, "no common stamp"))
+        else:
+            view = PairView(pmus[pair.north], pmus[pair.south], new[1], middle, now_ns)
+            after.append(_updated(params, supervisor, tables, old, new[0], view))
+    return tuple(after)
+
+
+def _faults(params: Params, supervisor: Supervisor, pair: Pair, pmus: Sequence[Pmu]) -> str:
+    """Which checks of which PMU disable an instance."""
+    return ", ".join(
+        f"{params.pmus[index].name}: {' '.join(names)}"
+        for index in pair
+        if (names := supervisor.named(pmus[index].raised & supervisor.disabling))
+    )
+
+
+def _updated(
+    params: Params, supervisor: Supervisor, tables: Tables, last: Instance, slot: int, view: PairView
 ) -> Instance:
-    """One instance after its PMUs' tick."""
-    north, south = pmus[pair.north], pmus[pair.south]
-    if (north.raised | south.raised) & supervisor.disabling:
-        reasons = [
-            f"{params.pmus[index].name}: {' '.join(names)}"
-            for index in pair
-            if (names := supervisor.named(pmus[index].raised & supervisor.disabling))
-        ]
-        return disable(last, ", ".join(reasons))
-    found = difference(north, south, params.align)
-    if found is None:
-        return last if last.state is InstanceState.DISABLED else disable(last, "no common stamp")
-    slot, delta_f_mhz = found
-    raised = 0
-    for bit, test in supervisor.instance_tests:
-        if test(params, north, south, now_ns):
-            raised |= bit
+    """One instance that has a difference at ``slot``."""
+    raised, held, evidence = judge(tables.instance, last.held, (params, view))
     if raised & supervisor.disabling:
-        return disable(last, " ".join(supervisor.named(raised & supervisor.disabling)), raised)
+        reason = " ".join(supervisor.named(raised & supervisor.disabling))
+        return disable(last, reason)._replace(raised=raised, held=held, evidence=evidence)
     new_frames = 1 if last.slot is None else slot - last.slot
     verified = last.verified + max(new_frames, 0)
     state = TRANSITIONS.get((last.state, "pair"), last.state)
-    if state is _INITIALISING and verified >= params.init_frames:
+    if state is InstanceState.INITIALISING and verified >= params.init_frames:
         state = TRANSITIONS[state, "verified"]
     else:
         state = TRANSITIONS.get((state, "new" if new_frames > 0 else "hold"), state)
-    return _new(Instance, (state, verified, slot, delta_f_mhz, last.reason, raised))
+    return Instance(state, verified, slot, view.delta_f_mhz, last.reason, raised, held, evidence)
 
 
 def choose(params: Params, instances: Sequence[Instance], active: int | None, keep: bool) -> int | None:

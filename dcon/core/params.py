@@ -1,78 +1,25 @@
 """Every number of the controller, with its unit, bounds, default and source.
 
-``Params`` is what ``[controller]`` of the initialisation file fills, ``Thresholds`` is ``[supervisor]``; the bounds
-and sources are in each field's ``metadata`` (keys ``unit``, ``low``, ``high``, ``source``), where ``dcon check``
-finds them. Sources: "section ..." is the paper (Pierre et al.); "choice" is ours, where no source fixes a number.
+``Params`` is what ``[controller]`` of the initialisation file fills; :class:`~dcon.core.thresholds.Thresholds` is
+``[supervisor]``, where the form of a setting is explained, :class:`~dcon.core.probe.Probing` is ``[probing]``.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from dcon.core.bands import Bands, bands_of
 from dcon.core.differentiator import Coefficients, coefficients
+from dcon.core.probe import SWEPT, Probing, Waveform, waveform
+from dcon.core.thresholds import Thresholds, check_bounds, setting
 from dcon.limiter import LIMIT_MW
 from pmutools.errors import SettingsError
 
 NS = 1_000_000_000
-RING_SIZE = 32
-"""Frames of each PMU kept for alignment: four times the largest skew accepted."""
-
-
-def setting(default: float, unit: str, source: str, low: float = 0.0, high: float = math.inf) -> Any:
-    """A field in ``unit`` whose value must be a number within ``low``..``high``."""
-    return field(default=default, metadata={"unit": unit, "source": source, "low": low, "high": high})
-
-
-def check_bounds(values: object) -> None:
-    """Raise SettingsError for the first field of a dataclass that is outside its metadata's bounds."""
-    for item in fields(values):  # type: ignore[arg-type]
-        low, high = item.metadata.get("low"), item.metadata.get("high")
-        if low is None or high is None:
-            continue
-        value = getattr(values, item.name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise SettingsError(f"{item.name} = {value!r}: must be {low:g} to {high:g} {item.metadata['unit']}")
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """Limits of the checks in :mod:`dcon.core.rows`, one key each."""
-
-    gap_ms: float = setting(50.0, "ms", "section IV b", 1)
-    """No frame of a PMU for longer than this, or three frame periods if that is more, disables its instances."""
-    max_clock_error_us: float = setting(100.0, "us", "choice: 2.2° at 60 Hz")
-    """Worst-case clock error that a PMU may report in MSG_TQ or PMU_TQ."""
-    latency_warn_ms: float = setting(90.0, "ms", "choice: Table I sums to 88 before the tick")
-    """Stamp to arrival: warn above."""
-    latency_max_ms: float = setting(200.0, "ms", "choice")
-    """Stamp to arrival: disable above."""
-    latency_min_ms: float = setting(-5.0, "ms", "choice: a negative delay is a clock error", -1e3, 0)
-    """Stamp to arrival: disable below."""
-    voltage_min_pu: float = setting(0.80, "pu", "choice", 0, 2)
-    """|V1| below this share of nominal disables (PMUs with a known nominal voltage only)."""
-    voltage_max_pu: float = setting(1.20, "pu", "choice", 0, 2)
-    """|V1| above disables."""
-    voltage_step_pu: float = setting(0.10, "pu", "choice", 0, 2)
-    """Change of |V1| from one frame to the next: disable above."""
-    angle_step_deg: float = setting(5.0, "deg", "choice", 0, 180)
-    """Angle increment minus the one before it: disable above."""
-    frequency_max_hz: float = setting(1.0, "Hz", "choice", 0, 10)
-    """Deviation from nominal: disable above."""
-    rocof_max_hz_s: float = setting(5.0, "Hz/s", "choice", 0, 100)
-    """Change of the computed frequency: disable above."""
-    alignment_age_ms: float = setting(200.0, "ms", "choice")
-    """Age of the newest common stamp of a pair: disable the instance above."""
-    alignment_skew_frames: float = setting(8, "frames", "choice: Figs. 13-15 run at 6", 0, RING_SIZE - 1)
-    """Newest stamps of a pair apart: disable the instance above."""
-    delta_f_max_mhz: float = setting(200.0, "mHz", "choice: a larger difference is an island, not a mode")
-    """|Δf| of the active instance: disarm above."""
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +34,34 @@ class PmuParams:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "base_v", (self.nominal_kv or 0.0) * 1e3 / math.sqrt(3))
+
+
+@dataclass(frozen=True)
+class Line:
+    """The DC line that the command is added to: ``[pdci]``."""
+
+    required: bool = False
+    """Status of the line must be known: without it no arming, and a loss disarms."""
+    rating_ns_mw: float = setting(3220.0, "MW", "path rating, north to south", 0, 1e5)
+    """Largest power north to south."""
+    rating_sn_mw: float = setting(3100.0, "MW", "path rating, south to north", 0, 1e5)
+    """Largest power south to north."""
+    minimum_mw: float = setting(310.0, "MW", "choice: 10 % of the rating", 0, 1e5)
+    """Smallest power that the line carries, in either direction."""
+    status_age_s: float = setting(10.0, "s", "choice", 0, 3600)
+    """A status older than this is not known."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Required:
+    """Sources of :class:`~dcon.core.values.Surroundings` that must be there: without them no arming, a loss acts."""
+
+    gps: bool = False
+    watchdog: bool = False
+    server: bool = False
 
 
 class Pair(NamedTuple):
@@ -134,6 +109,9 @@ class Params:
     arm_limit_mw: float = setting(LIMIT_MW / 2, "MW", "choice", 0, LIMIT_MW)
     """The active instance's own command must be smaller than this to arm and to activate."""
     thresholds: Thresholds = field(default_factory=Thresholds)
+    line: Line = field(default_factory=Line)
+    required: Required = field(default_factory=Required)
+    probing: Probing = field(default_factory=Probing)
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -141,6 +119,8 @@ class Params:
             raise SettingsError(
                 f"gain_mw_per_mhz = {self.gain_mw_per_mhz:g}: must be 0 to {self.gain_max_mw_per_mhz:g} MW/mHz"
             )
+        if self.probing.kind in SWEPT and self.probing.high_hz >= self.tick_hz / 2:
+            raise SettingsError(f"high_hz = {self.probing.high_hz:g}: must be below half of {self.tick_hz} ticks/s")
         names = [pmu.name for pmu in self.pmus]
         if len(set(names)) < len(names):
             raise SettingsError(f"two PMUs of one name: {', '.join(names)}")
@@ -187,6 +167,21 @@ class Params:
     @cached_property
     def return_frames(self) -> int:
         return self.init_frames + round(self.return_s * self.rate_hz)
+
+    @cached_property
+    def requires(self) -> bool:
+        """Whether any source of the surroundings must be there."""
+        return self.line.required or self.required != Required()
+
+    @cached_property
+    def bands(self) -> Bands:
+        """Filters that watch the command."""
+        return bands_of(self.thresholds, self.tick_hz)
+
+    @cached_property
+    def waveform(self) -> Waveform:
+        """The probing signal; worked out when it is first asked for."""
+        return waveform(self.probing, self.tick_hz)
 
     @cached_property
     def transfer_ticks(self) -> int:

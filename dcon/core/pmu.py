@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from operator import attrgetter
 
-from dcon.core.checks import Supervisor
-from dcon.core.differentiator import EMPTY, Filter, advance, midpoint
-from dcon.core.params import RING_SIZE, Params, PmuParams
+from dcon.core.checks import Supervisor, Tables, judge
+from dcon.core.differentiator import EMPTY, Coefficients, Filter, advance, midpoint
+from dcon.core.params import Params, PmuParams
+from dcon.core.quick import next_frame
 from dcon.core.stamps import is_apart
-from dcon.core.state import Pmu
+from dcon.core.state import UNKNOWN, Evidence, Freq, Pmu
+from dcon.core.thresholds import RING_SIZE
 from dcon.core.values import Sample
 from pmutools.timebase import slot as slot_of
 
@@ -19,7 +21,7 @@ _stamp = attrgetter("time_ns")
 
 def end_run(pmu: Pmu) -> Pmu:
     """``pmu`` with its run ended: the next good frame starts filter and ring afresh."""
-    return pmu._replace(slot=None, filter=EMPTY, ring=())
+    return pmu._replace(slot=None, filter=EMPTY, ring=(), freq=UNKNOWN)
 
 
 def turn(params: Params, pmu: Pmu, theta_rad: float) -> tuple[Filter, tuple[float, ...]]:
@@ -28,6 +30,18 @@ def turn(params: Params, pmu: Pmu, theta_rad: float) -> tuple[Filter, tuple[floa
     if filtered.frames < 3:
         return filtered, ()
     return filtered, (filtered.f_hz, *pmu.ring[: RING_SIZE - 1])
+
+
+def smoothed(c: Coefficients, last: Freq, deviation_hz: float) -> Freq:
+    """FREQ (from nominal) of one more frame through the low-pass in H(z), so that both lag alike.
+
+    H(z) without its derivative K (1 - z⁻¹) / (1 + z⁻¹) / 2π is (b 2π / K) (1 + z⁻¹)² / (1 - a1 z⁻¹ + a2 z⁻²), K = 2 Fs.
+    The first frame of a run is taken for what came before it.
+    """
+    if math.isnan(deviation_hz) or math.isnan(last.y1):
+        return Freq(deviation_hz, deviation_hz, deviation_hz, deviation_hz)
+    x1, x2, y1, y2 = last
+    return Freq(deviation_hz, x1, c.low_pass * (deviation_hz + 2 * x1 + x2) + c.a1 * y1 - c.a2 * y2, y1)
 
 
 def extend(params: Params, last: Pmu, sample: Sample, slot: int, now_ns: int) -> Pmu:
@@ -45,6 +59,7 @@ def extend(params: Params, last: Pmu, sample: Sample, slot: int, now_ns: int) ->
         ring=ring,
         idle_ticks=0,
         raised=last.raised,
+        freq=smoothed(params.coefficients, last.freq, sample.frequency_hz - params.nominal_hz),
     )
 
 
@@ -54,7 +69,9 @@ def bridge(params: Params, last: Pmu, sample: Sample) -> Pmu | None:
         return None
     theta = midpoint(last.filter.theta_rad, math.atan2(sample.v1.imag, sample.v1.real))
     filtered, ring = turn(params, last, theta)
-    return last._replace(filter=filtered, ring=ring)  # slot and stamp come with ``sample``
+    halfway_hz = (last.freq.x1 + sample.frequency_hz - params.nominal_hz) / 2
+    freq = smoothed(params.coefficients, last.freq, halfway_hz)
+    return last._replace(filter=filtered, ring=ring, freq=freq)  # slot and stamp come with ``sample``
 
 
 def follows(params: Params, last: Pmu, sample: Sample, slot: int) -> bool:
@@ -67,16 +84,44 @@ def follows(params: Params, last: Pmu, sample: Sample, slot: int) -> bool:
 
 
 def update(
-    params: Params, supervisor: Supervisor, site: PmuParams, last: Pmu, samples: Sequence[Sample], now_ns: int
+    params: Params,
+    supervisor: Supervisor,
+    tables: Tables,
+    site: PmuParams,
+    last: Pmu,
+    samples: Sequence[Sample],
+    now_ns: int,
+    unread: int = 0,
 ) -> Pmu:
-    """One PMU after one tick.
+    """One PMU after one tick; ``unread`` frames of it could not be read.
 
     Flags of frames stay up over ticks without frames; no frame is no evidence that a fault has gone.
     """
+    if len(samples) == 1 and tables.quick is not None and not unread:
+        uneventful = next_frame(tables.quick, site.base_v, last, samples[0], now_ns)
+        if uneventful is not None:
+            return uneventful
+    return _update(params, supervisor, tables, site, last, samples, now_ns, unread)
+
+
+def _update(
+    params: Params,
+    supervisor: Supervisor,
+    tables: Tables,
+    site: PmuParams,
+    last: Pmu,
+    samples: Sequence[Sample],
+    now_ns: int,
+    unread: int,
+) -> Pmu:
     bits = supervisor.bits
     pmu = last
     raised = 0
+    evidence: Evidence = ()
     taken = False
+    if unread:
+        raised |= bits["unread_frame"]
+        evidence = ((bits["unread_frame"], float(unread)),)
     for sample in sorted(samples, key=_stamp) if len(samples) > 1 else samples:
         if pmu.slot is not None and sample.time_ns <= pmu.time_ns:
             raised |= bits["stale_frame"]
@@ -88,18 +133,18 @@ def update(
             raised |= bits["stamp_step" if bridged is None else "interpolated"]
             pmu = end_run(pmu) if bridged is None else bridged
         new = extend(params, pmu, sample, slot, now_ns)
-        found = 0
-        for bit, test in supervisor.frame_tests:
-            if test(params, site, pmu, new, sample):
-                found |= bit
+        found, held, seen = judge(tables.frame, pmu.held, (params, site, pmu, new, sample))
         raised |= found
+        evidence += seen
+        if held:
+            new = new._replace(held=held)
         pmu = end_run(new) if found & supervisor.disabling else new
     if not taken:
         pmu = pmu._replace(idle_ticks=pmu.idle_ticks + 1)
-        raised |= last.raised & supervisor.of_frames
-    for bit, test_pmu in supervisor.pmu_tests:
-        if test_pmu(params, pmu, now_ns):
-            raised |= bit
-            if bit & supervisor.disabling:
-                pmu = end_run(pmu)
-    return pmu if raised == pmu.raised else pmu._replace(raised=raised)
+        kept = last.raised & supervisor.of_frames
+        evidence += tuple(item for item in last.evidence if item[0] & kept & ~raised)
+        raised |= kept
+    found, _, seen = judge(tables.pmu, (), (params, pmu, now_ns))
+    if found & supervisor.disabling:
+        pmu = end_run(pmu)
+    return pmu._replace(raised=raised | found, evidence=evidence + seen)

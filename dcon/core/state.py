@@ -6,9 +6,30 @@ import cmath
 from typing import NamedTuple
 
 from dcon.core.differentiator import EMPTY, Filter
+from dcon.core.feedback import QUIET, Feedback
 from dcon.core.law import Transfer
 from dcon.core.params import Params
+from dcon.core.probe import IDLE, Probe
+from dcon.core.register import NO_FLAGS, Register
 from dcon.core.values import InstanceState, Mode, SystemState
+
+Evidence = tuple[tuple[int, float], ...]
+"""(bit, what was found) of checks that are up."""
+
+
+class Freq(NamedTuple):
+    """The PMU's own FREQ through the low-pass that the differentiator has in it: inputs and outputs of two frames.
+
+    Hz from nominal; NaN before the first frame of a run, and where the PMU sends none.
+    """
+
+    x1: float = cmath.nan
+    x2: float = cmath.nan
+    y1: float = cmath.nan
+    y2: float = cmath.nan
+
+
+UNKNOWN = Freq()
 
 
 class Pmu(NamedTuple):
@@ -33,6 +54,10 @@ class Pmu(NamedTuple):
     """Ticks since a frame was accepted."""
     raised: int = 0
     """Checks that are up, as bits."""
+    freq: Freq = UNKNOWN
+    held: tuple[int, ...] = ()
+    """Frames for which the condition of each check that takes its time has held; () is all 0."""
+    evidence: Evidence = ()
 
 
 _READY, _HELD = InstanceState.READY, InstanceState.HELD  # looking a member up costs as much as comparing it
@@ -49,6 +74,9 @@ class Instance(NamedTuple):
     delta_f_mhz: float = cmath.nan
     reason: str = ""
     raised: int = 0
+    held: tuple[int, ...] = ()
+    """Ticks for which the condition of each check that takes its time has held; () is all 0."""
+    evidence: Evidence = ()
 
     @property
     def is_ready(self) -> bool:
@@ -66,10 +94,21 @@ class State(NamedTuple):
     gain_mw_per_mhz: float
     target_gain_mw_per_mhz: float
     command_mw: float
-    """Of the last tick."""
+    """Of the last tick, without probing."""
     transfer: Transfer
     raised: int
     """System checks that are up, as bits."""
+    held: tuple[int, ...] = ()
+    driven_mw: float = 0.0
+    """Output of the last tick."""
+    probe: Probe = IDLE
+    feedback: Feedback = QUIET
+    angle_deg: float | None = None
+    """Of the active instance, north minus south; None without one."""
+    overruns: int = 0
+    """Of the last second: bit k is the tick k ticks ago."""
+    flags: Register = NO_FLAGS
+    """By (name, subject); bounded by the number of checks times that of PMUs and instances."""
 
 
 def initial_state(params: Params, *, mode: Mode = Mode.OPEN_LOOP, verified: bool = False) -> State:

@@ -1,37 +1,32 @@
 """One tick of the controller: a pure function of parameters, memory, inputs and time.
 
 Order within a tick (section IV a-e): frames of each PMU through checks and differentiator; alignment and difference
-of each instance; which instance is active; orders and checks move the system's state; gain, transfer and limit make
-the command; all of it becomes the record.
+of each instance; which instance is active; checks and orders move the system's state; gain, transfer, probing signal
+and limit make the command; all of it becomes the record.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from dcon import limiter
 from dcon.core import instance as instances_of
 from dcon.core import pmu as pmus_of
-from dcon.core.checks import Supervisor, SystemView
-from dcon.core.law import Transfer, approach, command_mw, saturate
+from dcon.core.checks import Supervisor, SystemView, Tables, judge, which
+from dcon.core.command import NONE, Command, form
+from dcon.core.differentiator import wrap
+from dcon.core.feedback import QUIET, watched
+from dcon.core.law import Transfer, approach, command_mw
+from dcon.core.orders import SYSTEM, Ordered, is_stop, moved, obey
 from dcon.core.params import Params
+from dcon.core.probe import IDLE
+from dcon.core.register import Register, fallen, latched, risen, with_changes
 from dcon.core.rows import CORE
-from dcon.core.state import Instance, Pmu, State
-from dcon.core.system import (
-    DRIVING,
-    MODE_IS_FREE,
-    TRANSITIONS,
-    ArmView,
-    Trigger,
-    mode_of,
-    refusal,
-    trigger_of,
-)
-from dcon.core.values import Event, Inputs, InstanceRecord, InstanceState, Mode, Order, Record, SystemState
+from dcon.core.state import Evidence, Instance, Pmu, State
+from dcon.core.system import DRIVING, ArmView, Trigger
+from dcon.core.values import NOTHING, Event, Flag, Inputs, InstanceRecord, InstanceState, Record, SystemState
 
-_SYSTEM = "system"
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time: there are many instances
 _DISABLED = InstanceState.DISABLED  # looking a member up costs as much as comparing it
 
@@ -51,69 +46,99 @@ def step(
 
 
 def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor: Supervisor) -> tuple[State, Record]:
+    tables = supervisor.tables(params)
+    told = inputs.surroundings
+    unread = told.unread or (0,) * len(params.pmus)
     pmus = tuple(
-        pmus_of.update(params, supervisor, site, last, samples, now_ns)
-        for site, last, samples in zip(params.pmus, state.pmus, inputs.samples, strict=True)
+        [
+            pmus_of.update(params, supervisor, tables, site, last, samples, now_ns, lost)
+            for site, last, samples, lost in zip(params.pmus, state.pmus, inputs.samples, unread, strict=True)
+        ]
     )
-    instances = tuple(
-        instances_of.update(params, supervisor, pair, last, pmus, now_ns)
-        for pair, last in zip(params.instances, state.instances, strict=True)
-    )
-    events = _flag_events(params, supervisor, state, pmus, instances)
-    ready = sum(instance.is_ready for instance in instances)
+    instances = instances_of.update(params, supervisor, tables, state.instances, pmus, now_ns)
+    ready = sum([instance.is_ready for instance in instances])
     active = instances_of.choose(params, instances, state.active, keep=state.system in DRIVING)
-    if active != state.active and active is not None:
-        events.append(Event("selected", params.instance_names[active]))
     gain = approach(state.gain_mw_per_mhz, state.target_gain_mw_per_mhz, params.gain_ramp_per_s / params.tick_hz)
     own_mw = _own_mw(params, instances, gain)
 
-    followed = None if active is None else instances[active]
-    view = ArmView(ready, 0.0 if active is None else own_mw[active])
-    orders = _Orders(state.system, state.mode, state.target_gain_mw_per_mhz)
-    for order in sorted(inputs.orders, key=_is_stop):  # a stop has the last word in its tick
-        orders = _obey(params, orders, order, view, events)
-    raised = 0
-    for bit, test in supervisor.system_tests:
-        if test(params, SystemView(orders.system, ready, followed)):
-            raised |= bit
-    system = _supervise(supervisor, orders.system, raised, ready, events)
+    angle_deg = None if active is None else _angle_deg(params, pmus, active)
+    overruns = (state.overruns << 1 | bool(told.overrun)) & ((1 << params.tick_hz) - 1)
+    view = SystemView(
+        state.system,
+        ready,
+        None if active is None else instances[active],
+        angle_deg,
+        _slipped(state, active, angle_deg),
+        overruns,
+        state.feedback,
+        state.driven_mw,
+        told,
+        now_ns,
+    )
+    rows = tables.system[which(state.system is SystemState.ACTIVE, told != NOTHING or params.requires)]
+    raised, held, evidence = judge(rows, state.held, (params, view))
 
-    target_mw = own_mw[active] if system is SystemState.ACTIVE and active is not None else 0.0
-    source = active if system is SystemState.ACTIVE else None
-    last_source = state.active if state.system is SystemState.ACTIVE else None
-    if system not in DRIVING:
-        transfer = Transfer()
-    elif source != last_source:
-        transfer = Transfer(state.command_mw - target_mw, params.transfer_ticks, params.transfer_ticks)
-    else:
-        transfer = state.transfer.tick()
-    wanted_mw = saturate(target_mw + transfer.residual_mw, params.limit_mw)
-    if system in DRIVING:
-        limited = limiter.limit(wanted_mw, state.command_mw, 1.0 / params.tick_hz, params.limit_mw)
-    else:
-        limited = limiter.Limited(0.0, "")
-    if limited.reason == "invalid":
-        raised |= supervisor.bits["command_invalid"]
-        system = _move(system, Trigger.TRIP, "command_invalid", events)
-    elif limited.reason == "slew":
-        raised |= supervisor.bits["slew_limited"]
-    if system is SystemState.RAMPDOWN and transfer.left_ticks == 0 and limited.mw == 0.0:
-        system = _move(system, Trigger.RAMPED, "", events)
-    events.extend(Event(name, _SYSTEM) for name in supervisor.named(raised & ~state.raised))
+    events: list[Event] = []
+    flags = _changed_flags(params, supervisor, tables, state, pmus, instances, now_ns, events)
+    if active != state.active and active is not None:
+        events.append(Event("selected", params.instance_names[active]))
+    flags = _compared(supervisor, tables, flags, SYSTEM, state.raised, raised, evidence, now_ns)
+    ordered = Ordered(state.system, state.mode, state.target_gain_mw_per_mhz, state.probe, flags)
+    if inputs.orders:
+        arm = ArmView(
+            ready,
+            0.0 if active is None else own_mw[active],
+            told,
+            now_ns,
+            state.driven_mw,
+            tuple(latched(flags)),
+            tuple(supervisor.named(raised & (supervisor.tripping | supervisor.stopping))),
+        )
+        for order in sorted(inputs.orders, key=is_stop):
+            ordered = obey(params, ordered, order, arm, events)
+    system, flags = _supervise(supervisor, ordered.system, ordered.flags, raised, ready, events)
+
+    command = form(
+        params, state, system, ordered.mode, active, 0.0 if active is None else own_mw[active], ordered.probe
+    )
+    extra = 0
+    if not command.valid:
+        extra |= supervisor.bits["command_invalid"]
+    elif command.slewed:
+        extra |= supervisor.bits["slew_limited"]
+    if extra or state.raised & supervisor.of_commands:
+        flags = _compared(supervisor, tables, flags, SYSTEM, state.raised & supervisor.of_commands, extra, (), now_ns)
+        raised |= extra
+    if not command.valid:
+        system, flags = _supervise(supervisor, system, flags, extra, 0, events)
+        command = NONE
+    if system is SystemState.RAMPDOWN and command.is_over:
+        system = moved(system, Trigger.RAMPED, "", events)
+    if ordered.probe.is_on and not command.probe.is_on:
+        events.append(Event("probe_end", SYSTEM))
+    if new := raised & ~state.raised:
+        events.extend(Event(name, SYSTEM) for name in supervisor.named(new))
 
     after = State(
-        pmus=pmus,
-        instances=instances,
-        system=system,
-        mode=orders.mode,
-        active=active,
-        gain_mw_per_mhz=gain,
-        target_gain_mw_per_mhz=orders.target_gain_mw_per_mhz,
-        command_mw=limited.mw,
-        transfer=transfer,
-        raised=raised,
+        pmus,
+        instances,
+        system,
+        ordered.mode,
+        active,
+        gain,
+        ordered.target_gain_mw_per_mhz,
+        command.command_mw,
+        command.transfer,
+        raised,
+        held,
+        command.driven_mw,
+        command.probe,
+        watched(params, state.feedback, command.command_mw) if system is SystemState.ACTIVE else QUIET,
+        angle_deg,
+        overruns,
+        flags,
     )
-    return after, _record(params, after, own_mw, events, now_ns)
+    return after, _record(params, after, command, own_mw, events, _changes(state.flags, flags), now_ns)
 
 
 def _own_mw(params: Params, instances: Sequence[Instance], gain: float) -> list[float]:
@@ -125,61 +150,38 @@ def _own_mw(params: Params, instances: Sequence[Instance], gain: float) -> list[
     ]
 
 
-def _is_stop(order: Order) -> bool:
-    return order.name == Trigger.ESTOP
+def _angle_deg(params: Params, pmus: Sequence[Pmu], active: int) -> float:
+    """North minus south by the newest frame of each; their stamps may be ``alignment_skew_frames`` apart."""
+    north, south = params.instances[active]
+    return math.degrees(wrap(pmus[north].filter.theta_rad - pmus[south].filter.theta_rad))
 
 
-class _Orders(NamedTuple):
-    """What orders may change."""
-
-    system: SystemState
-    mode: Mode
-    target_gain_mw_per_mhz: float
-
-
-def _obey(params: Params, now: _Orders, order: Order, view: ArmView, events: list[Event]) -> _Orders:
-    """``now`` after one order; an event says what became of it."""
-    name, value = order
-    if (trigger := trigger_of(name)) is not None:
-        # A second stop changes nothing and is no mistake.
-        why = "" if trigger is Trigger.ESTOP else refusal(params, now.system, trigger, view)
-        if not why:
-            return now._replace(system=_move(now.system, trigger, "order", events))
-    elif (mode := mode_of(name)) is not None:
-        why = "" if now.system in MODE_IS_FREE or mode is now.mode else f"not in {now.system}: disarm first"
-        if not why:
-            events.append(Event(str(mode), _SYSTEM, "order"))
-            return now._replace(mode=mode)
-    elif name == "gain":
-        why = "" if 0 <= value <= params.gain_max_mw_per_mhz else f"must be 0 to {params.gain_max_mw_per_mhz:g} MW/mHz"
-        if not why:
-            events.append(Event(name, _SYSTEM, f"{value:g}"))
-            return now._replace(target_gain_mw_per_mhz=float(value))
-    else:
-        why = "no such order"
-    events.append(Event("refused", str(name), why))
-    return now
+def _slipped(state: State, active: int | None, angle_deg: float | None) -> bool:
+    if angle_deg is None or state.angle_deg is None or active != state.active:
+        return False
+    return abs(angle_deg - state.angle_deg) > 180
 
 
 def _supervise(
-    supervisor: Supervisor, system: SystemState, raised: int, ready: int, events: list[Event]
-) -> SystemState:
-    """The system's state after what is not an order; a stop that was ordered stands."""
+    supervisor: Supervisor, system: SystemState, flags: Register, raised: int, ready: int, events: list[Event]
+) -> tuple[SystemState, Register]:
+    """State and register after what is not an order; a stop that was ordered stands. What acts is latched."""
     if ready:
-        system = _move(system, Trigger.READY, "", events)
-    if raised & supervisor.disarming:
-        system = _move(system, Trigger.DISARM, " ".join(supervisor.named(raised & supervisor.disarming)), events)
-    if raised & supervisor.tripping:
-        system = _move(system, Trigger.TRIP, " ".join(supervisor.named(raised & supervisor.tripping)), events)
-    return system
-
-
-def _move(system: SystemState, trigger: Trigger, why: str, events: list[Event]) -> SystemState:
-    after = TRANSITIONS.get((system, trigger))
-    if after is None:
-        return system
-    events.append(Event(after.lower(), _SYSTEM, why))
-    return after
+        system = moved(system, Trigger.READY, "", events)
+    for trigger, mask in (
+        (Trigger.DISARM, supervisor.disarming),
+        (Trigger.TRIP, supervisor.tripping),
+        (Trigger.ESTOP, supervisor.stopping),
+    ):
+        if not raised & mask:
+            continue
+        names = supervisor.named(raised & mask)
+        after = moved(system, trigger, " ".join(names), events)
+        if after is not system:
+            acted = [flag for name in names if (flag := flags.get((name, SYSTEM))) is not None]
+            flags = with_changes(flags, [flag._replace(latched=True) for flag in acted])
+            system = after
+    return system, flags
 
 
 _INSTANCE_EVENTS = {
@@ -189,31 +191,79 @@ _INSTANCE_EVENTS = {
 }
 
 
-def _flag_events(
-    params: Params, supervisor: Supervisor, last: State, pmus: Sequence[Pmu], instances: Sequence[Instance]
-) -> list[Event]:
-    """Checks that rose and instances that changed state, in this tick."""
-    events: list[Event] = []
+def _changed_flags(
+    params: Params,
+    supervisor: Supervisor,
+    tables: Tables,
+    last: State,
+    pmus: Sequence[Pmu],
+    instances: Sequence[Instance],
+    now_ns: int,
+    events: list[Event],
+) -> Register:
+    """The register after what PMUs and instances show; checks that rose and changes of state become events."""
+    flags = last.flags
     for site, before, pmu in zip(params.pmus, last.pmus, pmus, strict=True):
-        if new := pmu.raised & ~before.raised:
-            events.extend(Event(name, site.name) for name in supervisor.named(new))
-    for index, (old, instance) in enumerate(zip(last.instances, instances, strict=True)):
-        name = params.instance_names[index]
-        if new := instance.raised & ~old.raised:
-            events.extend(Event(check, name) for check in supervisor.named(new))
-        if instance.state is not old.state and not (instance.is_ready and old.is_ready):
-            events.append(Event(_INSTANCE_EVENTS[instance.state], name, instance.reason))
-    return events
+        if pmu.raised != before.raised:
+            events.extend(Event(name, site.name) for name in supervisor.named(pmu.raised & ~before.raised))
+            flags = _compared(supervisor, tables, flags, site.name, before.raised, pmu.raised, pmu.evidence, now_ns)
+    if instances is last.instances:
+        return flags
+    for name, old, new in zip(params.instance_names, last.instances, instances, strict=True):
+        if new.raised != old.raised:
+            events.extend(Event(check, name) for check in supervisor.named(new.raised & ~old.raised))
+            flags = _compared(supervisor, tables, flags, name, old.raised, new.raised, new.evidence, now_ns)
+        if new.state is not old.state and not (new.is_ready and old.is_ready):
+            events.append(Event(_INSTANCE_EVENTS[new.state], name, new.reason))
+    return flags
 
 
-def _record(params: Params, state: State, own_mw: Sequence[float], events: Sequence[Event], now_ns: int) -> Record:
+def _compared(
+    supervisor: Supervisor,
+    tables: Tables,
+    flags: Register,
+    subject: str,
+    before: int,
+    now: int,
+    evidence: Evidence,
+    now_ns: int,
+) -> Register:
+    """The register after a subject's checks went from ``before`` to ``now``."""
+    if before == now:
+        return flags
+    changes = []
+    found = dict(evidence)
+    for name in supervisor.named(now & ~before):
+        bit = supervisor.bits[name]
+        value = found.get(bit, math.nan)
+        low, high = tables.limits.get(bit, (math.nan, math.nan))
+        changes.append(risen(flags, name, subject, now_ns, value, low if value < low else high))
+    gone = [flags.get((name, subject)) for name in supervisor.named(before & ~now)]
+    changes.extend(fallen(flag, now_ns) for flag in gone if flag is not None)
+    return with_changes(flags, changes)
+
+
+def _changes(before: Register, after: Register) -> tuple[Flag, ...]:
+    if after is before:
+        return ()
+    return tuple(flag for key, flag in after.items() if before.get(key) is not flag)
+
+
+def _record(
+    params: Params,
+    state: State,
+    command: Command,
+    own_mw: Sequence[float],
+    events: Sequence[Event],
+    changes: tuple[Flag, ...],
+    now_ns: int,
+) -> Record:
     flags = state.raised
     for pmu in state.pmus:
         flags |= pmu.raised
     for instance in state.instances:
         flags |= instance.raised
-    driven = state.mode is Mode.CLOSED_LOOP and state.system in DRIVING
-    active = state.active
+    active, nominal_hz = state.active, params.nominal_hz
     return Record(
         tick_ns=now_ns,
         state=state.system,
@@ -222,16 +272,19 @@ def _record(params: Params, state: State, own_mw: Sequence[float], events: Seque
         gain_mw_per_mhz=state.gain_mw_per_mhz,
         delta_f_mhz=math.nan if active is None else state.instances[active].delta_f_mhz,
         command_mw=state.command_mw,
-        output_v=limiter.volts(state.command_mw) if driven else 0.0,
-        probe_mw=0.0,
+        output_v=limiter.volts(state.driven_mw),
+        probe_mw=command.probe_mw,
         flags=flags,
-        f_hz=tuple(params.nominal_hz + pmu.ring[0] if pmu.ring else math.nan for pmu in state.pmus),
-        age_ms=tuple(math.nan if pmu.arrival_ns is None else (now_ns - pmu.time_ns) / 1e6 for pmu in state.pmus),
+        f_hz=tuple([nominal_hz + pmu.ring[0] if pmu.ring else math.nan for pmu in state.pmus]),
+        age_ms=tuple([math.nan if pmu.arrival_ns is None else (now_ns - pmu.time_ns) / 1e6 for pmu in state.pmus]),
         instances=tuple(
-            _new(InstanceRecord, (instance.state, index == active, instance.delta_f_mhz, mw, instance.reason))
-            for index, (instance, mw) in enumerate(zip(state.instances, own_mw, strict=True))
+            [
+                _new(InstanceRecord, (instance.state, index == active, instance.delta_f_mhz, mw, instance.reason))
+                for index, (instance, mw) in enumerate(zip(state.instances, own_mw, strict=True))
+            ]
         ),
         events=tuple(events),
+        flag_changes=changes,
     )
 
 
@@ -239,12 +292,22 @@ def _failed(
     params: Params, state: State, now_ns: int, supervisor: Supervisor, error: Exception
 ) -> tuple[State, Record]:
     """0 MW and FAULT; the memory is that of the last good tick, and the frames of this one count as lost."""
-    events = [Event("internal_error", _SYSTEM, f"{type(error).__name__}: {error}")]
+    events = [Event("internal_error", SYSTEM, f"{type(error).__name__}: {error}")]
+    bit = supervisor.bits["internal_error"]
+    flags = state.flags
+    if not state.raised & bit:
+        flags = with_changes(flags, [risen(flags, "internal_error", SYSTEM, now_ns)])
+    system, flags = _supervise(supervisor, state.system, flags, bit, 0, events)
     after = state._replace(
-        system=_move(state.system, Trigger.TRIP, "internal_error", events),
+        system=system,
         command_mw=0.0,
+        driven_mw=0.0,
+        probe=IDLE,
         transfer=Transfer(),
-        raised=state.raised | supervisor.bits["internal_error"],
+        feedback=QUIET,
+        raised=state.raised | bit,
+        flags=flags,
     )
     shown = after._replace(pmus=(Pmu(),) * len(after.pmus))  # the input that failed may be anything, now_ns too
-    return after, _record(params, shown, (0.0,) * len(after.instances), events, now_ns)
+    own_mw = (0.0,) * len(after.instances)
+    return after, _record(params, shown, NONE, own_mw, events, _changes(state.flags, flags), now_ns)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 
 class SystemState(StrEnum):
@@ -50,6 +52,8 @@ class Sample(NamedTuple):
     """The whole byte: leap flags and MSG_TQ."""
     time_base: int = 1_000_000
     """Ticks per second of the stream's FRACSEC: how finely ``time_ns`` could be stamped."""
+    v2: complex = complex(cmath.nan, cmath.nan)
+    """Negative-sequence voltage, V RMS; NaN where the three phases are not given."""
 
 
 class Order(NamedTuple):
@@ -57,6 +61,52 @@ class Order(NamedTuple):
 
     name: str
     value: float = 0.0
+    text: str = ""
+    """What the order concerns: of ``ack`` the flag, as ``NAME`` or ``NAME SUBJECT``, empty for all."""
+    who: str = ""
+    """Who ordered it."""
+
+
+class Pdci(NamedTuple):
+    """State of the DC line as last reported at ``time_ns``; power counts north to south."""
+
+    time_ns: int
+    power_mw: float
+    in_service: bool = True
+    dcon_enabled: bool = True
+    scheduled_mw: float = math.nan
+    """Without the modulation; NaN where the line does not say."""
+
+
+class Surroundings(NamedTuple):
+    """What a tick is told besides PMU frames: of the controller's own platform and of the line it acts on.
+
+    None is "not fitted": the checks of it are off, unless a setting requires it.
+    """
+
+    gps_age_s: float | None = None
+    """Since the controller's clock last had its GPS lock; 0 while it has."""
+    watchdog_healthy: bool | None = None
+    """The watchdog lives, and would keep its relays closed."""
+    estop_released: bool | None = None
+    pdci: Pdci | None = None
+    readback_v: float | None = None
+    """Output read back: of the last tick's."""
+    overrun: bool | None = None
+    """The last tick was not done before this one was due."""
+    response_gain: float | None = None
+    """Response of the line to the command, MW per MW, as estimated elsewhere."""
+    response_lag_ms: float | None = None
+    server_age_s: float | None = None
+    """Since the server was last heard."""
+    disk_free_percent: float | None = None
+    """Of the disk that is logged to."""
+    unread: tuple[int, ...] = ()
+    """Frames of each PMU, in the order of ``Params.pmus``, that came and could not be read; () is none."""
+
+
+NOTHING: Final = Surroundings()
+"""Nothing is told: a simulation."""
 
 
 class Inputs(NamedTuple):
@@ -65,6 +115,29 @@ class Inputs(NamedTuple):
     samples: tuple[tuple[Sample, ...], ...]
     """One tuple a PMU in the order of ``Params.pmus``, frames in order of arrival; may be empty."""
     orders: tuple[Order, ...] = ()
+    surroundings: Surroundings = NOTHING
+
+
+class Flag(NamedTuple):
+    """A check that is, or has been, up for one ``subject``: a PMU, an instance or ``system``."""
+
+    name: str
+    subject: str
+    up: bool
+    first_ns: int
+    """The tick in which it first rose."""
+    last_ns: int
+    """The tick in which it last rose, or fell."""
+    times: int
+    """How often it rose."""
+    value: float
+    """What was found when it last rose, in the check's unit; NaN where it is no number."""
+    limit: float
+    """The bound that ``value`` broke; NaN where there is none."""
+    latched: bool
+    """It disarmed or tripped the controller: no arming until it is down and acknowledged."""
+    acknowledged: str = ""
+    """By whom, since it last rose; "" is by nobody."""
 
 
 class Event(NamedTuple):
@@ -72,7 +145,8 @@ class Event(NamedTuple):
 
     ``name`` is a check's name (its flag rose), a system state's name in lower case (it was entered), a mode,
     ``selected`` (instance ``subject`` is now the active one), ``instance_disabled``, ``instance_initialising``,
-    ``instance_ready``, ``gain`` or ``refused`` (an order). ``subject`` is a PMU, an instance or ``system``.
+    ``instance_ready``, ``gain``, ``ack`` (by whom: detail), ``probe_start``, ``probe_stop``, ``probe_end``, or
+    ``refused`` (an order). ``subject`` is a PMU, an instance or ``system``.
     """
 
     name: str
@@ -105,10 +179,11 @@ class Record(NamedTuple):
     delta_f_mhz: float
     """Of the active instance; NaN without one."""
     command_mw: float
-    """Computed and limited; always finite."""
+    """Computed and limited, without the probing signal; always finite."""
     output_v: float
-    """Volts to drive: 0 in open loop."""
+    """Volts to drive; 0 in open loop, unless a probing signal is driven there."""
     probe_mw: float
+    """The probing signal's part of what is driven, or (in open loop, unless it is driven there) of what would be."""
     flags: int
     """Checks that are up (uint64); bit names: ``Supervisor.names``."""
     f_hz: tuple[float, ...]
@@ -117,3 +192,5 @@ class Record(NamedTuple):
     """Tick time minus stamp of each PMU's newest frame; NaN where there is none."""
     instances: tuple[InstanceRecord, ...]
     events: tuple[Event, ...]
+    flag_changes: tuple[Flag, ...] = ()
+    """Entries of the flag register that changed in this tick, as they are now."""

@@ -133,6 +133,7 @@ class Platform:
                 pmus=[site.name for site in settings.sites],
                 instances=settings.params.instance_names,
                 flags=CORE.names,
+                probe_file=settings.probe_file,
             ) as writer:
                 self._loop(writer, OrderBook(orders, start_ns), end_ns)
         finally:
@@ -208,7 +209,7 @@ class Platform:
         try:
             for name, frame, time_ns in configs:
                 log.config(name, frame, time_ns)
-            log.tick(tick.record, tick.frames, orders, timing=timing)
+            log.tick(tick.record, tick.frames, orders, timing=timing, surroundings=tick.surroundings)
         except SourceError as error:
             LOG.error("%s; disarming, for nothing unrecorded is driven", error)
             self._log_failure = error

@@ -5,7 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from dcon.core.values import Event, InstanceRecord, InstanceState, Mode, Order, Record, Sample, SystemState
+from dcon.core.values import (
+    NOTHING,
+    Event,
+    Flag,
+    InstanceRecord,
+    InstanceState,
+    Mode,
+    Order,
+    Pdci,
+    Record,
+    Sample,
+    Surroundings,
+    SystemState,
+)
 from pmutools.schema.descriptors import message_class
 from pmutools.schema.pmu_log import PmuFrame
 
@@ -21,15 +34,6 @@ class Timing(NamedTuple):
 
     compute_us: float
     late_us: float
-
-
-class Pdci(NamedTuple):
-    """State of the DC line as last reported at ``time_ns``; ``power_mw`` north to south."""
-
-    time_ns: int
-    power_mw: float
-    in_service: bool = True
-    dcon_enabled: bool = True
 
 
 class Watchdog(NamedTuple):
@@ -80,7 +84,7 @@ def encode_instances(record: Record) -> bytes:
     return bytes(message.SerializeToString())
 
 
-def decode_record(tick: Any, instance: Any, events: Sequence[Any]) -> Record:
+def decode_record(tick: Any, instance: Any, events: Sequence[Any], flags: Sequence[Any] = ()) -> Record:
     """The record of one tick from its decoded messages; raises ValueError for a state that this version lacks."""
     try:
         return Record(
@@ -97,7 +101,8 @@ def decode_record(tick: Any, instance: Any, events: Sequence[Any]) -> Record:
             tuple(tick.f_hz),
             tuple(tick.age_ms),
             decode_instances(instance),
-            tuple(Event(event.name, event.subject, event.detail) for event in events),
+            tuple([Event(event.name, event.subject, event.detail) for event in events]),
+            tuple(map(decode_flag, flags)),
         )
     except KeyError as error:
         raise ValueError(f"tick {tick.tick_ns}: unknown state {error}") from None
@@ -116,8 +121,43 @@ def encode_event(tick_ns: int, event: Event) -> bytes:
 
 
 def encode_order(tick_ns: int, order: Order) -> bytes:
-    message = message_class("Setting")(tick_ns=tick_ns, name=order.name, value=order.value)
+    return bytes(message_class("Setting")(tick_ns=tick_ns, **order._asdict()).SerializeToString())
+
+
+def decode_order(message: Any) -> Order:
+    return Order(message.name, message.value, message.text, message.who)
+
+
+def encode_flag(tick_ns: int, flag: Flag) -> bytes:
+    return bytes(message_class("Flag")(tick_ns=tick_ns, **flag._asdict()).SerializeToString())
+
+
+def decode_flag(message: Any) -> Flag:
+    return Flag._make(getattr(message, name) for name in Flag._fields)
+
+
+def encode_surroundings(tick_ns: int, told: Surroundings) -> bytes:
+    given = {name: value for name, value in told._asdict().items() if value is not None}
+    unread, pdci = given.pop("unread"), given.pop("pdci", None)
+    message = message_class("Surroundings")(tick_ns=tick_ns, told=list(given), unread=unread, **given)
+    if pdci is not None:
+        message.told.append("pdci")
+        for name, value in pdci._asdict().items():
+            setattr(message, f"pdci_{name}", value)
     return bytes(message.SerializeToString())
+
+
+def decode_surroundings(message: Any | None) -> Surroundings:
+    """The inverse; no message is NOTHING. What this version does not know is left out."""
+    if message is None:
+        return NOTHING
+    told: dict[str, Any] = {name: getattr(message, name) for name in message.told if name in _TOLD}
+    if "pdci" in message.told:
+        told["pdci"] = Pdci._make(getattr(message, f"pdci_{name}") for name in Pdci._fields)
+    return Surroundings(**told, unread=tuple(message.unread))
+
+
+_TOLD = frozenset(Surroundings._fields) - {"pdci", "unread"}
 
 
 def encode_timing(tick_ns: int, timing: Timing) -> bytes:
@@ -130,7 +170,7 @@ def encode_pdci(tick_ns: int, pdci: Pdci) -> bytes:
 
 
 def decode_pdci(message: Any) -> Pdci:
-    return Pdci(message.time_ns, message.power_mw, message.in_service, message.dcon_enabled)
+    return Pdci._make(getattr(message, name) for name in Pdci._fields)
 
 
 def encode_watchdog(watchdog: Watchdog) -> bytes:

@@ -14,9 +14,9 @@ from types import TracebackType
 from typing import IO, Any, NamedTuple
 
 import pmutools
-from dcon.core.values import Inputs, Order, Record, Sample
+from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surroundings
 from dcon.session import codec
-from dcon.session.codec import Pdci, Timing, Watchdog
+from dcon.session.codec import Timing, Watchdog
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.log_writer import LogWriter
@@ -26,6 +26,7 @@ from pmutools.schema.pmu_log import PmuFrame, PmuTopics, config_name, from_messa
 SESSION = "session"
 """Name of the metadata record that makes an MCAP file a session log."""
 INI_NAME = "dcon.ini"
+PROBE_NAME = "probing.csv"
 
 
 class SessionWriter:
@@ -41,6 +42,8 @@ class SessionWriter:
         Configuration frame of each PMU, by name; those that come later go to :meth:`config`.
     metadata
         Seed, plant, scenario and what else is known of the run, as text; the version is added.
+    probe_file
+        What the file of ``[probing]`` holds, attached; empty for none.
     pmus, instances, flags
         Names, in the order of the lists in a :class:`~dcon.core.values.Record` and of the bits in its ``flags``.
     """
@@ -55,6 +58,7 @@ class SessionWriter:
         pmus: Sequence[str],
         instances: Sequence[str],
         flags: Sequence[str] = (),
+        probe_file: bytes = b"",
     ) -> None:
         self._log = LogWriter(target)
         self._pmus = PmuTopics(self._log)
@@ -66,6 +70,8 @@ class SessionWriter:
         }
         self._log.metadata(SESSION, {"version": pmutools.__version__, **metadata, **names})
         self._log.attach(INI_NAME, ini_text.encode(), media_type="text/plain")
+        if probe_file:
+            self._log.attach(PROBE_NAME, probe_file, media_type="text/csv")
         for name, frame in configs.items():
             self._pmus.config(name, frame)
         self._channels = {
@@ -82,8 +88,11 @@ class SessionWriter:
         *,
         timing: Timing | None = None,
         pdci: Pdci | None = None,
+        surroundings: Surroundings = NOTHING,
     ) -> None:
-        """Log one tick: the ``frames`` and ``orders`` it was given, what it decided, how it ran.
+        """Log one tick: the ``frames``, ``orders`` and ``surroundings`` it was given, what it decided, how it ran.
+
+        ``pdci`` is the line's status beside the tick; by default the one that the tick was told.
 
         ``frames`` in the order in which the controller got them. Ticks are POSIX times: a frame's tick 0 means none.
         """
@@ -95,10 +104,15 @@ class SessionWriter:
             self._pmus.write(frame, tick_ns)
         for order in orders:
             self._write("Setting", codec.encode_order(tick_ns, order), tick_ns)
+        if surroundings != NOTHING:
+            self._write("Surroundings", codec.encode_surroundings(tick_ns, surroundings), tick_ns)
+            pdci = pdci or surroundings.pdci
         self._write("Tick", codec.encode_tick(record, self._instances), tick_ns)
         self._write("Instance", codec.encode_instances(record), tick_ns)
         for event in record.events:
             self._write("Event", codec.encode_event(tick_ns, event), tick_ns)
+        for flag in record.flag_changes:
+            self._write("Flag", codec.encode_flag(tick_ns, flag), tick_ns)
         if timing is not None:
             self._write("Timing", codec.encode_timing(tick_ns, timing), tick_ns)
         if pdci is not None:
@@ -140,6 +154,7 @@ class LoggedTick(NamedTuple):
     """Something of the log is missing just before this tick: a replay cannot know the controller's state."""
     configs: tuple[tuple[str, bytes], ...] = ()
     """Configuration frames that came since the last tick (or before the first), with the PMU's name."""
+    surroundings: Surroundings = NOTHING
 
     def inputs(self, pmus: Sequence[str]) -> Inputs:
         """What ``step`` was given; ``pmus`` are the names in the order of its parameters."""
@@ -147,7 +162,7 @@ class LoggedTick(NamedTuple):
         for frame in self.frames:
             if frame.name in samples:
                 samples[frame.name].append(codec.sample_of(frame))
-        return Inputs(tuple(map(tuple, samples.values())), self.orders)
+        return Inputs(tuple(map(tuple, samples.values())), self.orders, self.surroundings)
 
 
 @dataclass(slots=True)
@@ -168,8 +183,9 @@ class TickMessages:
 class SessionReader:
     """A session log. What precedes the first tick is read at once.
 
-    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``configs`` (first frame of
-    each PMU). ``damage`` and ``incomplete_ticks`` are those of the last iteration, once it is exhausted.
+    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``probe_file`` (None where
+    there is none), ``configs`` (first frame of each PMU). ``damage`` and ``incomplete_ticks`` are those of the last
+    iteration, once it is exhausted.
     Raises SourceError for a file that cannot be read or is no session log.
     """
 
@@ -186,6 +202,7 @@ class SessionReader:
         self.pmus = _names(names, "pmus")
         self.instances = _names(names, "instances")
         self.flags = _names(names, "flags")
+        self.probe_file = self.attachments.get(PROBE_NAME)
         self.ini_text = self.attachments.get(INI_NAME, b"").decode(errors="replace")
         self.configs = {name: data for key, data in self.attachments.items() if (name := config_name(key)) is not None}
 
@@ -245,7 +262,9 @@ class SessionReader:
         return None
 
 
-_TICK_MESSAGES = frozenset(("PmuFrame", "Setting", "Tick", "Instance", "Event", "Timing", "Pdci"))
+_TICK_MESSAGES = frozenset(
+    ("PmuFrame", "Setting", "Surroundings", "Tick", "Instance", "Event", "Flag", "Timing", "Pdci")
+)
 
 
 def _names(metadata: Mapping[str, str], key: str) -> tuple[str, ...]:
@@ -262,11 +281,12 @@ def _logged_tick(group: TickMessages, after_loss: bool) -> LoggedTick:
         raise ValueError(f"tick {group.tick_ns} is not whole")
     timing, pdci = group.one("Timing"), group.one("Pdci")
     return LoggedTick(
-        codec.decode_record(tick, instance, group.messages.get("Event", ())),
+        codec.decode_record(tick, instance, group.messages.get("Event", ()), group.messages.get("Flag", ())),
         tuple(from_message(name, message) for name, message in group.frames),
-        tuple(Order(order.name, order.value) for order in group.messages.get("Setting", ())),
+        tuple(map(codec.decode_order, group.messages.get("Setting", ()))),
         None if timing is None else Timing(timing.compute_us, timing.late_us),
         None if pdci is None else codec.decode_pdci(pdci),
         after_loss,
         tuple(group.configs),
+        codec.decode_surroundings(group.one("Surroundings")),
     )

@@ -76,7 +76,7 @@ def replay(path: str, changes: Sequence[str] = (), observe: Observer | None = No
     reader = SessionReader(path)
     if not reader.ini_text:
         raise SourceError(f"{path}: the log holds no initialisation file (its beginning is lost), so no replay")
-    settings = parse(reader.ini_text, f"{path}: {_INI}", tuple(changes))
+    settings = parse(reader.ini_text, f"{path}: {_INI}", tuple(changes), probe_file=reader.probe_file)
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
     result = Replay(changes=tuple(changes))
     for tick in reader.ticks():
@@ -88,7 +88,7 @@ def replay(path: str, changes: Sequence[str] = (), observe: Observer | None = No
         for frame in tick.frames:
             arrived = Frame(frame.wire, frame.arrival_ns, frame.stamp_source, 0)
             frames.setdefault(frame.name, []).append(arrived)
-        now = engine.tick(frames, tick.orders, tick.record.tick_ns)
+        now = engine.tick(frames, tick.orders, tick.record.tick_ns, tick.surroundings)
         result.ticks += 1
         result.largest_mw = max(result.largest_mw, abs(now.record.command_mw - tick.record.command_mw))
         found = (None if changes else _changed_frame(tick, now.frames)) or _changed_record(tick.record, now.record)

@@ -188,7 +188,7 @@ def _run(
         if tell is not None and number % TOLD_TICKS == 0:
             tell(outcome.tick_s[-1])
         if log is not None:
-            log.tick(tick.record, tick.frames, orders)
+            log.tick(tick.record, tick.frames, orders, surroundings=tick.surroundings)
 
 
 def _grid(plan: Plan, command_ns: int) -> Grid:

@@ -10,12 +10,15 @@ from enum import StrEnum
 from typing import Any
 
 from dcon.core import instance
-from dcon.core.params import Params, Thresholds
+from dcon.core.checks import Check, bound
+from dcon.core.params import Line, Params
+from dcon.core.probe import Probing
 from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, MODE_IS_FREE, ORDERS, PERMISSIVES, TRANSITIONS, Trigger
+from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
 from dcon.drivers import udp_command
-from dcon.settings import FROM_SITES, Log, Output, Platform, Site
+from dcon.settings import ELSEWHERE, Log, Output, Platform, Server, Site, Watchdog
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
@@ -96,12 +99,42 @@ def permissives() -> str:
     return table(("permissive", "refused with"), ((code(row.name), row.text) for row in PERMISSIVES))
 
 
+DEFAULTS = Params.paired(("N",), ("S",))
+LIMITS = {item.name: item for item in fields(Thresholds)}
+UNITS = {"_s": "s", "_frames": "frames", "_ticks": "ticks"}
+
+
+def condition(row: Check[Any]) -> str:
+    """When a check is up, in words, with the defaults and their keys."""
+    if row.value is None:
+        return ""
+
+    def shown(given: Any) -> tuple[str, str]:
+        key = given if isinstance(given, str) else ""
+        unit = LIMITS[key].metadata["unit"] if key else row.unit
+        return f"{bound(DEFAULTS, given):g} {unit}".strip(), code(key) if key else ""
+
+    (high, high_key), (low, low_key) = shown(row.high), shown(row.low)
+    what = (row.value.__doc__ or "").split("\n")[0].removesuffix(".").replace("``", "`")
+    has_high, has_low = bound(DEFAULTS, row.high) < math.inf, bound(DEFAULTS, row.low) > -math.inf
+    limits = f"outside {low} to {high}" if has_high and has_low else f"> {high}" if has_high else f"< {low}"
+    if row.name == "not_finite":
+        limits = ""
+    keys = ", ".join(key for key in (low_key, high_key) if key)
+    text = f"{what} {limits}".strip() + (f" ({keys})" if keys else "")
+    if row.hold:
+        unit = next(unit for suffix, unit in UNITS.items() if row.hold.endswith(suffix))
+        text += f" for {LIMITS[row.hold].default:g} {unit} ({code(row.hold)})"
+    return prose(text)
+
+
 def checks() -> str:
     """Every check, in the order of its bit in ``flags``."""
     rows = (
-        (bit, code(name), scope, f"**{action}**", text) for bit, (name, scope, action, text) in enumerate(CORE.rows)
+        (bit, code(row.name), row.scope, condition(row), f"**{row.action}**", row.text)
+        for bit, row in enumerate(CORE.rows)
     )
-    return table(("bit", "check", "scope", "action", "what the operator reads"), rows)
+    return table(("bit", "check", "scope", "up while", "action", "what the operator reads"), rows)
 
 
 def _number(value: object) -> str:
@@ -121,6 +154,10 @@ def _range(item: Field[Any]) -> str:
     return f"≥ {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
 
 
+def _words(item: Field[Any]) -> str:
+    return " ".join(item.metadata["choices"]) if "choices" in item.metadata else _range(item)
+
+
 def numbers(cls: type, leave_out: Iterable[str] = ()) -> str:
     """Settings whose unit, bounds and source are in the field's metadata."""
     says = attribute_docs(cls)
@@ -128,7 +165,7 @@ def numbers(cls: type, leave_out: Iterable[str] = ()) -> str:
     for item in fields(cls):
         if item.name not in leave_out:
             unit, source = item.metadata.get("unit", ""), item.metadata.get("source", "")
-            rows.append((code(item.name), _number(item.default), unit, _range(item), says.get(item.name, ""), source))
+            rows.append((code(item.name), _number(item.default), unit, _words(item), says.get(item.name, ""), source))
     return table(("key", "default", "unit", "range", "meaning", "source"), rows)
 
 
@@ -179,8 +216,12 @@ GENERATORS = {
     "instance-diagram": lambda: diagram(instance.TRANSITIONS, "DISABLED"),
     "permissives": permissives,
     "checks": checks,
-    "settings-controller": lambda: numbers(Params, FROM_SITES),
+    "settings-controller": lambda: numbers(Params, ELSEWHERE),
     "settings-supervisor": lambda: numbers(Thresholds),
+    "settings-probing": lambda: numbers(Probing, ("samples",)),
+    "settings-pdci": lambda: numbers(Line),
+    "settings-watchdog": lambda: keys(Watchdog),
+    "settings-server": lambda: keys(Server),
     "settings-pmu": lambda: keys(Site),
     "settings-output": lambda: keys(Output),
     "settings-platform": lambda: keys(Platform),

@@ -24,7 +24,7 @@ from dcon.core.differentiator import (
     response,
     wrap,
 )
-from dcon.core.sequence import positive_sequence
+from dcon.core.sequence import sequences
 from pmutools.errors import SettingsError
 
 RATES = (30, 50, 60, 100, 120)
@@ -193,4 +193,4 @@ def test_positive_sequence() -> None:
     a = cmath.rect(1, 2 * math.pi / 3)
     v1, v2, v0 = 3 + 4j, 0.5 - 0.1j, 0.2j
     phases = (v0 + v1 + v2, v0 + a * a * v1 + a * v2, v0 + a * v1 + a * a * v2)
-    assert positive_sequence(*phases) == pytest.approx(v1)
+    assert sequences(*phases)[0] == pytest.approx(v1)

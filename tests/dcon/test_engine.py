@@ -132,7 +132,7 @@ def test_an_unusable_configuration_costs_the_pmu_until_a_good_one_comes() -> Non
     problem = bench.engine.reconfigure("N1", replace(config, data_rate=50))
     assert problem is not None and "sends 50 frames/s" in problem
     record = bench.tick()
-    assert names(record) == ["config_unusable N1"]
+    assert names(record) == ["config_unusable N1", "unread_frame N1"]
     later = bench.run(6)
     assert any("arrival_gap N1" in names(record) for record in later)
     assert later[-1].instances[0].state is InstanceState.DISABLED

@@ -9,7 +9,7 @@ from support.loop import params
 from support.streams import MS, START_NS, play, samples, ticks
 
 from dcon.core.instance import TRANSITIONS, choose, update
-from dcon.core.params import Pair, Params, Thresholds
+from dcon.core.params import Params, Thresholds
 from dcon.core.rows import CORE
 from dcon.core.state import Instance, Pmu, State, initial_state
 from dcon.core.values import InstanceState, Record, Sample
@@ -83,7 +83,7 @@ def fresh(slot: int, f: float = 0.0, **fields: object) -> Pmu:
 )
 def test_checks_of_a_pair(north: Pmu, south: Pmu, age_ms: float, want: str) -> None:
     now_ns = max(north.time_ns, south.time_ns) + round(age_ms * MS)
-    after = update(PAIR, CORE, Pair(0, 1), Instance(InstanceState.READY, 2000), (north, south), now_ns)
+    (after,) = update(PAIR, CORE, CORE.tables(PAIR), (Instance(InstanceState.READY, 2000),), (north, south), now_ns)
     assert after.reason == want and (after.state is InstanceState.DISABLED) == bool(want)
     assert after.verified == (0 if want else 2001)
 

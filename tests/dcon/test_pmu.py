@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import pytest
 from support.streams import MS, START_NS, samples
 
+from dcon.core import pmu as pmus_of
 from dcon.core.params import Params
-from dcon.core.pmu import update
 from dcon.core.rows import CORE
 from dcon.core.state import Pmu
 from dcon.core.values import Sample
 
 PARAMS = Params.paired(("N1",), ("S1",), nominal_kv=500.0)
 BRIDGING = Params.paired(("N1",), ("S1",), nominal_kv=500.0, interpolate_single_loss=True)
+
+
+def update(params: Params, pmu: Pmu, frames: Sequence[Sample], now_ns: int) -> Pmu:
+    return pmus_of.update(params, CORE, CORE.tables(params), params.pmus[0], pmu, frames, now_ns)
+
+
 GOOD = list(samples(lambda t: 0.01 * math.sin(2.5 * t), 40))
 PERIOD_NS = 1e9 / 60
 
@@ -26,7 +32,7 @@ def feed(frames: Iterable[Sample], params: Params = PARAMS, start: Pmu | None = 
     """One frame a tick."""
     pmu = Pmu() if start is None else start
     for frame in frames:
-        pmu = update(params, CORE, params.pmus[0], pmu, (frame,), frame.arrival_ns + 5 * MS)
+        pmu = update(params, pmu, (frame,), frame.arrival_ns + 5 * MS)
     return pmu
 
 
@@ -42,7 +48,7 @@ def test_a_good_stream_raises_nothing_and_fills_the_ring() -> None:
 
 def test_frames_of_one_tick_are_taken_in_order_of_their_stamps() -> None:
     now = GOOD[5].arrival_ns + MS
-    shuffled = update(PARAMS, CORE, PARAMS.pmus[0], Pmu(), (GOOD[2], GOOD[0], GOOD[3], GOOD[1]), now)
+    shuffled = update(PARAMS, Pmu(), (GOOD[2], GOOD[0], GOOD[3], GOOD[1]), now)
     assert flags(shuffled) == [] and shuffled.ring == feed(GOOD[:4]).ring
 
 
@@ -55,13 +61,13 @@ def test_a_lost_frame_starts_another_run() -> None:
 
 def test_a_frame_that_comes_too_late_is_ignored() -> None:
     before = feed([*GOOD[:10], GOOD[11], GOOD[12]])
-    after = update(PARAMS, CORE, PARAMS.pmus[0], before, (GOOD[10],), GOOD[12].arrival_ns + 10 * MS)
+    after = update(PARAMS, before, (GOOD[10],), GOOD[12].arrival_ns + 10 * MS)
     assert after[:8] == before[:8] and flags(after) == ["stale_frame"]
 
 
 def test_a_duplicate_is_ignored() -> None:
     now = GOOD[9].arrival_ns + MS
-    twice = update(PARAMS, CORE, PARAMS.pmus[0], feed(GOOD[:9]), (GOOD[9], GOOD[9]), now)
+    twice = update(PARAMS, feed(GOOD[:9]), (GOOD[9], GOOD[9]), now)
     assert twice.ring == feed(GOOD[:10]).ring and flags(twice) == ["stale_frame"]
 
 
@@ -81,7 +87,7 @@ def test_fifty_ms_without_a_frame() -> None:
     pmu = feed(GOOD[:10])
     arrival = GOOD[9].arrival_ns
     for late_ms, want in ((33, []), (50, []), (50.1, ["arrival_gap"]), (900, ["arrival_gap"])):
-        pmu = update(PARAMS, CORE, PARAMS.pmus[0], pmu, (), arrival + round(late_ms * MS))
+        pmu = update(PARAMS, pmu, (), arrival + round(late_ms * MS))
         assert flags(pmu) == want
     assert pmu.slot is None and pmu.ring == ()
 
@@ -89,20 +95,20 @@ def test_fifty_ms_without_a_frame() -> None:
 def test_a_clock_set_back_does_not_hide_a_gap() -> None:
     pmu = feed(GOOD[:10])
     for _ in range(6):
-        pmu = update(PARAMS, CORE, PARAMS.pmus[0], pmu, (), GOOD[9].arrival_ns - 3600 * 1000 * MS)
+        pmu = update(PARAMS, pmu, (), GOOD[9].arrival_ns - 3600 * 1000 * MS)
     assert flags(pmu) == ["arrival_gap"]
 
 
 def test_an_arrival_from_the_future_does_not_hide_a_gap() -> None:
     frame = GOOD[9]._replace(arrival_ns=GOOD[9].arrival_ns + 100 * MS)
-    pmu = update(PARAMS, CORE, PARAMS.pmus[0], feed(GOOD[:9]), (frame,), GOOD[9].arrival_ns)
-    pmu = update(PARAMS, CORE, PARAMS.pmus[0], pmu, (), GOOD[9].arrival_ns + 51 * MS)
+    pmu = update(PARAMS, feed(GOOD[:9]), (frame,), GOOD[9].arrival_ns)
+    pmu = update(PARAMS, pmu, (), GOOD[9].arrival_ns + 51 * MS)
     assert "arrival_gap" in flags(pmu) and pmu.slot is None
 
 
 def test_a_clock_that_jumped_back_gets_a_new_run_after_the_gap() -> None:
     hour = 3600 * 1000 * MS
-    pmu = update(PARAMS, CORE, PARAMS.pmus[0], feed(GOOD[:10]), (), GOOD[9].arrival_ns + 60 * MS)
+    pmu = update(PARAMS, feed(GOOD[:10]), (), GOOD[9].arrival_ns + 60 * MS)
     earlier = [frame._replace(time_ns=frame.time_ns - hour, arrival_ns=frame.arrival_ns - hour) for frame in GOOD]
     assert flags(feed(earlier[:5], start=pmu)) == [] and len(feed(earlier[:5], start=pmu).ring) == 3
 
@@ -169,7 +175,7 @@ def test_a_voltage_step_shows_from_the_second_frame_of_a_run() -> None:
 
 def test_flags_of_frames_stay_up_while_nothing_comes() -> None:
     pmu = feed([*GOOD[:20], changed(stat=0x8000)])
-    pmu = update(PARAMS, CORE, PARAMS.pmus[0], pmu, (), GOOD[20].arrival_ns + 20 * MS)
+    pmu = update(PARAMS, pmu, (), GOOD[20].arrival_ns + 20 * MS)
     assert flags(pmu) == ["stat_error"]
 
 
@@ -206,6 +212,6 @@ def test_an_unseen_lost_frame_would_have_been_a_spike() -> None:
     spikes = []
     pmu = Pmu()
     for frame in hidden:
-        pmu = update(PARAMS, CORE, PARAMS.pmus[0], pmu, (frame,), frame.time_ns + 60 * MS)
+        pmu = update(PARAMS, pmu, (frame,), frame.time_ns + 60 * MS)
         spikes.append(abs(pmu.ring[0] - 0.02) if pmu.ring else 0.0)
     assert max(spikes) == pytest.approx(0.112 * 0.02, rel=0.01)

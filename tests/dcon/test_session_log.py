@@ -26,6 +26,7 @@ from support.sessions import (
     open_session,
     random_ticks,
     write_session,
+    write_tick,
 )
 
 import pmutools
@@ -40,7 +41,7 @@ from pmutools.schema.pmu_log import PmuFrame, PmuTopics
 
 def strip(tick: LoggedTick) -> object:
     """The logged tick as :class:`support.sessions.Tick` has it, floats as bits."""
-    return bits((tick.record, tick.frames, tick.orders, tick.timing, tick.pdci))
+    return bits((tick.record, tick.frames, tick.orders, tick.timing, tick.pdci, tick.surroundings))
 
 
 def test_round_trip_bit_for_bit(tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_inputs_are_grouped_by_tick_and_pmu_in_order_of_arrival(tmp_path: Path) 
             )
             for name in PMUS
         )
-        assert bits(logged.inputs(PMUS)) == bits(Inputs(expected, tick.orders))
+        assert bits(logged.inputs(PMUS)) == bits(Inputs(expected, tick.orders, tick.surroundings))
         assert logged.inputs(("S2", "absent")).samples[1] == ()
 
 
@@ -100,7 +101,7 @@ def test_every_topic_is_decoded_by_any_mcap_reader(tmp_path: Path) -> None:
     with open_session(path) as session:
         session.watchdog(Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5),)))
         for tick in ticks:
-            session.tick(tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
+            write_tick(session, tick)
     seen: dict[str, int] = {}
     with path.open("rb") as file:
         for schema, channel, message, proto in make_reader(
@@ -258,14 +259,14 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_flushed(tmp_path: Path) -> 
 _KILLED = """
 import sys, time
 from pathlib import Path
-from support.sessions import open_session, random_ticks
+from support.sessions import open_session, random_ticks, write_tick
 session = open_session(Path(sys.argv[1]))
 ticks = random_ticks(200)
 for tick in ticks[:130]:
-    session.tick(tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
+    write_tick(session, tick)
 session.flush()
 for tick in ticks[130:]:
-    session.tick(tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
+    write_tick(session, tick)
 print("flushed", flush=True)
 time.sleep(60)
 """

@@ -97,6 +97,32 @@ def test_other_rates_than_60() -> None:
 
 
 MISTAKES = {
+    "thresholds that exclude each other": (
+        "gap_ms = 60",
+        "voltage_max_pu = 0.7",
+        "dcon.ini:28: [supervisor]: voltage_min_pu = 0.8: must be below voltage_max_pu = 0.7",
+    ),
+    "an unknown signal": (
+        "[watchdog]",
+        "[watchdog]\n[probing]\nkind = sine",
+        "dcon.ini:34: [probing] kind: 'sine' is not one of none, square, multisine, chirp, file",
+    ),
+    "a signal from a file that is not given": (
+        "[watchdog]",
+        "[watchdog]\n[probing]\nkind = file",
+        "dcon.ini:33: [probing]: kind = file: no samples; give file = NAME.csv",
+    ),
+    "a signal from a file that is not there": (
+        "[watchdog]",
+        "[watchdog]\n[probing]\nkind = file\nfile = /nowhere/x.csv",
+        "dcon.ini:35: [probing] file: /nowhere/x.csv: No such file",
+    ),
+    "frequencies of a signal the wrong way round": (
+        "[watchdog]",
+        "[watchdog]\n[probing]\nlow_hz = 6",
+        "dcon.ini:33: [probing]: low_hz = 6: must be below high_hz = 5",
+    ),
+    "a rating below nothing": ("[pdci]", "[pdci]\nrating_ns_mw = -1", "dcon.ini:37: [pdci] rating_ns_mw: -1 is out of"),
     "an unknown section": ("[log]", "[logg]", "dcon.ini:37: [logg]: unknown section; did you mean 'log'?"),
     "an unknown key of the controller": (
         "align = true",
@@ -263,6 +289,34 @@ def test_changes_lie_over_the_file_and_know_where_they_come_from() -> None:
             parse(GOOD, "dcon.ini", (change,))
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("mw\n1\n", "no column 'probe_mw'; there are mw: set column"),
+        ("", "no column 'probe_mw'; there are none: set column"),
+        ("probe_mw\n1\n126\n", ":3: 126 is out of range; it must be -125 to 125"),
+        ("probe_mw\n1\nnan\n", ":3: 'nan' is not a finite number"),
+        ("t,probe_mw\n1\n", ":2: '' is not a number"),
+    ],
+)
+def test_a_probing_file_with_a_mistake_names_its_line(content: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "probe.csv"
+    path.write_text(content)
+    with pytest.raises(SettingsError) as caught:
+        parse(f"{GOOD}[probing]\nkind = file\nfile = {path}\n", "dcon.ini")
+    assert str(caught.value).startswith(f"dcon.ini:41: [probing] file: {path}") and message in str(caught.value)
+
+
+def test_a_probing_signal_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "probe.csv"
+    path.write_text("t,mw\n0,1.5\n1,-2\n")
+    text = f"{GOOD}[probing]\nkind = file\nfile = {path}\ncolumn = mw\n"
+    settings = parse(text, "dcon.ini")
+    assert settings.params.waveform.samples == (1.5, -2.0) and settings.probe_file == path.read_bytes()
+    path.unlink()
+    assert parse(text, "log", probe_file=settings.probe_file).params == settings.params
+
+
 def test_check_prints_every_setting_with_unit_and_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "dcon.ini"
     path.write_text(GOOD)
@@ -277,5 +331,6 @@ def test_check_prints_every_setting_with_unit_and_source(tmp_path: Path, capsys:
     assert [pmu["name"] for pmu in found["pmus"]] == ["N1", "N2", "S1", "S2", "X"]
     shown = {(row["section"], row["key"]): row["value"] for row in found["settings"]}
     assert shown["controller", "priority"] == "N1-S1,N1-S2,N2-S1,N2-S2"
-    assert {section for section, _ in shown} == {"controller", "supervisor", "platform", "output", "log"}
+    sections = "controller supervisor probing pdci platform watchdog server output log"
+    assert {section for section, _ in shown} == set(sections.split())
     assert len(shown) == len(found["settings"]) == len(effective(load(path)))

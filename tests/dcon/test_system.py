@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from support.streams import ARM, play, samples, ticks
 
-from dcon.core.checks import Action, Check, Scope, SystemTest
+from dcon.core.checks import Action, Check, Scope, SystemValue
 from dcon.core.params import Params
 from dcon.core.rows import CORE
 from dcon.core.state import Instance, State, initial_state
@@ -29,7 +29,9 @@ READY = play(PAIR, WINDOWS[:20])[-1][0]
 
 
 def at(state: SystemState, mode: Mode = Mode.CLOSED_LOOP) -> State:
-    return READY._replace(system=state, mode=mode, command_mw=45.0 if state in (S.ACTIVE, S.RAMPDOWN) else 0.0)
+    command_mw = 45.0 if state in (S.ACTIVE, S.RAMPDOWN) else 0.0
+    driven_mw = command_mw if mode is Mode.CLOSED_LOOP else 0.0
+    return READY._replace(system=state, mode=mode, command_mw=command_mw, driven_mw=driven_mw)
 
 
 def tick(state: State, *orders: Order, window: int = 20) -> tuple[State, Record]:
@@ -194,7 +196,9 @@ def test_a_frequency_difference_of_an_island_disarms() -> None:
 
 def test_a_supervisors_own_rows_act() -> None:
     rows = {
-        action: Check[SystemTest](f"own_{action}", Scope.SYSTEM, action, lambda _, view: view.state is S.ACTIVE, "ours")
+        action: Check[SystemValue](
+            f"own_{action}", Scope.SYSTEM, action, lambda _, view: view.state is S.ACTIVE, "ours"
+        )
         for action in (Action.WARN, Action.DISARM, Action.TRIP)
     }
     want = {Action.WARN: S.ACTIVE, Action.DISARM: S.RAMPDOWN, Action.TRIP: S.FAULT}
@@ -209,7 +213,7 @@ def test_a_supervisors_own_rows_act() -> None:
 def test_flag_bits_come_from_one_table() -> None:
     assert len(CORE.names) == len(set(CORE.names)) <= 64
     assert [CORE.bits[name] for name in CORE.names] == [1 << k for k in range(len(CORE.names))]
-    assert all(text for *_, text in CORE.rows)
+    assert all(row.text for row in CORE.rows)
     with pytest.raises(ValueError, match="two of one name"):
         replace(CORE, system=(*CORE.system, CORE.system[0]))
 

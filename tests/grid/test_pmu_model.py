@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from dcon.core.sequence import positive_sequence
+from dcon.core.sequence import sequences
 from pmutools.grid.pmu_model import PmuModel, fleet, measure
 from pmutools.grid.signals import Bus
 
@@ -20,7 +20,7 @@ def test_a_report_is_a_balanced_three_phase_voltage() -> None:
     seen = measure(PLAIN, BUSES, 1000, 60)
     assert abs(seen.v1) == pytest.approx(500e3 / math.sqrt(3))
     assert cmath.phase(seen.v1) == pytest.approx(0.3)
-    assert positive_sequence(seen.va, seen.vb, seen.vc) == pytest.approx(seen.v1)
+    assert sequences(seen.va, seen.vb, seen.vc)[0] == pytest.approx(seen.v1)
     assert cmath.phase(seen.vb / seen.va) == pytest.approx(-2 * math.pi / 3)
     assert (seen.frequency_hz, seen.rocof_hz_s) == (60.01, -0.02)
     assert seen.time_ns == 1000

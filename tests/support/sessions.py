@@ -8,8 +8,20 @@ import struct
 from pathlib import Path
 from typing import NamedTuple
 
-from dcon.core.values import Event, InstanceRecord, InstanceState, Mode, Order, Record, SystemState
-from dcon.session.codec import Pdci, Timing
+from dcon.core.values import (
+    NOTHING,
+    Event,
+    Flag,
+    InstanceRecord,
+    InstanceState,
+    Mode,
+    Order,
+    Pdci,
+    Record,
+    Surroundings,
+    SystemState,
+)
+from dcon.session.codec import Timing
 from dcon.session.log import SessionWriter
 from pmutools.flow import StampSource
 from pmutools.schema.pmu_log import PmuFrame
@@ -32,6 +44,7 @@ class Tick(NamedTuple):
     orders: tuple[Order, ...]
     timing: Timing | None
     pdci: Pdci | None
+    surroundings: Surroundings
 
 
 def random_ticks(count: int, seed: int = 1) -> list[Tick]:
@@ -43,8 +56,17 @@ def random_ticks(count: int, seed: int = 1) -> list[Tick]:
 def write_session(path: Path, ticks: list[Tick]) -> Path:
     with open_session(path) as session:
         for tick in ticks:
-            session.tick(tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
+            write_tick(session, tick)
     return path
+
+
+def write_tick(session: SessionWriter, tick: Tick) -> None:
+    session.tick(
+        *(tick.record, tick.frames, tick.orders),
+        timing=tick.timing,
+        pdci=tick.pdci,
+        surroundings=tick.surroundings,
+    )
 
 
 def open_session(path: Path) -> SessionWriter:
@@ -85,13 +107,40 @@ def _tick(rng: random.Random, tick_ns: int) -> Tick:
         tuple(_float(rng) for _ in PMUS),
         instances,
         tuple(Event("gain", "system", f"{k} → 9, ok") for k in range(rng.choice((0, 0, 0, 1, 2)))),
+        tuple(_flag(rng, tick_ns) for _ in range(rng.choice((0, 0, 0, 1, 2)))),
     )
+    pdci = rng.choice((None, _pdci(rng, tick_ns)))
     return Tick(
         record,
         tuple(_frame(rng, rng.choice(PMUS), tick_ns) for _ in range(rng.randint(0, 6))),
-        tuple(Order(rng.choice(("arm", "gain")), _float(rng)) for _ in range(rng.choice((0, 0, 1, 2)))),
+        tuple(
+            Order(rng.choice(("arm", "gain")), _float(rng), rng.choice(("", "frozen N1")), rng.choice(("", "Δ")))
+            for _ in range(rng.choice((0, 0, 1, 2)))
+        ),
         rng.choice((None, Timing(_float(rng), _float(rng)))),
-        rng.choice((None, Pdci(tick_ns - 5, _float(rng), rng.random() < 0.5, rng.random() < 0.5))),
+        pdci,
+        rng.choice((NOTHING, _surroundings(rng, pdci))),
+    )
+
+
+def _flag(rng: random.Random, tick_ns: int) -> Flag:
+    yes = (True, False)
+    counted = (tick_ns - rng.getrandbits(40), tick_ns, rng.getrandbits(20), _float(rng), _float(rng))
+    return Flag("voltage", rng.choice(PMUS), rng.choice(yes), *counted, rng.choice(yes), rng.choice(("", "A. B.")))
+
+
+def _pdci(rng: random.Random, tick_ns: int) -> Pdci:
+    return Pdci(tick_ns - 5, _float(rng), rng.random() < 0.5, rng.random() < 0.5, _float(rng))
+
+
+def _surroundings(rng: random.Random, pdci: Pdci | None) -> Surroundings:
+    """Any of it fitted or not; the line's status is that beside the tick, since it would be logged as that too."""
+    yes_no = (None, True, False)
+    return Surroundings(
+        *(rng.choice((None, _float(rng))), rng.choice(yes_no), rng.choice(yes_no), pdci),
+        *(rng.choice((None, _float(rng))), rng.choice(yes_no)),
+        *(rng.choice((None, _float(rng))) for _ in range(4)),
+        rng.choice(((), (0, 3, 0, 1))),
     )
 
 
