@@ -107,20 +107,20 @@ class Engine:
 
         ``surroundings`` is what the tick is told besides; frames that cannot be read are added to it.
         """
-        lost = [0] * len(self.sites)
         samples: list[list[Sample]] = [[] for _ in self.sites]
         readings: list[Reading] = []
+        lost = [0] * len(samples)
         for name, arrived in frames.items():
-            binding = self.bindings.get(name)
+            binding, index = self.bindings.get(name), self._index.get(name)
             for frame in arrived:
                 read = None if binding is None else _read(binding, frame)
-                if read is None:
-                    self.unread[name] = self.unread.get(name, 0) + 1
-                    if name in self._index:
-                        lost[self._index[name]] += 1
-                else:
-                    samples[self._index[name]].append(read.sample)
+                if read is not None and index is not None:
+                    samples[index].append(read.sample)
                     readings.append(read)
+                    continue
+                self.unread[name] = self.unread.get(name, 0) + 1
+                if index is not None:
+                    lost[index] += 1
         if any(lost):
             surroundings = surroundings._replace(unread=tuple(lost))
         inputs = Inputs(tuple(map(tuple, samples)), orders, surroundings)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,6 +17,7 @@ from pmutools.errors import SettingsError
 from pmutools.schema.pmu_log import PmuFrame, pmu_frame
 
 _ABSENT = complex(math.nan, math.nan)
+_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,25 +30,46 @@ class Binding:
     station: int
     voltage: tuple[int, ...]
     """Columns of V1, or of VA, VB and VC."""
+    places: tuple[int, ...]
+    """Of their magnitudes among a frame's values, where all are polar floats as they stand; else empty."""
 
     def read(self, frame: Frame) -> Reading | None:
         """A data frame as the controller sees it; None where it is not of this configuration."""
-        if len(frame.data) != self.layout.frame_size:
+        layout = self.layout
+        if len(frame.data) != layout.frame_size:
             return None
-        data = unpack_data(frame.data, self.config, self.layout)
+        data = unpack_data(frame.data, self.config, layout)
         time_ns, arrival_ns = data.time_ns, frame.arrival_ns
-        v1, v2 = self.voltages(data)
-        sample = Sample(
-            time_ns,
-            time_ns if arrival_ns is None else arrival_ns,
-            v1,
-            data.frequency(self.station),
-            data.stat(self.station),
-            data.time_quality,
-            self.layout.time_base,
-            v2,
+        v1, v2 = self._voltages(data)
+        sample = _new(
+            Sample,
+            (
+                time_ns,
+                time_ns if arrival_ns is None else arrival_ns,
+                v1,
+                data.frequency(self.station),
+                data.stat(self.station),
+                data.time_quality,
+                layout.time_base,
+                v2,
+            ),
         )
-        return Reading(self, frame, data, sample)
+        return _new(Reading, (self, frame, data, sample))
+
+    def _voltages(self, data: Data) -> tuple[complex, complex]:
+        """Positive- and negative-sequence voltage, V RMS; the latter NaN where the phases are not given."""
+        if self.places:
+            values, rect = data.values, cmath.rect
+            try:
+                phasors = [rect(values[place], values[place + 1]) for place in self.places]
+            except ValueError:  # an infinite angle
+                pass
+            else:
+                found = sequences(*phasors) if len(phasors) == 3 else (phasors[0], _ABSENT)
+                if cmath.isfinite(found[0]):
+                    return found
+        phasors = list(map(data.phasor, self.voltage))
+        return sequences(*phasors) if len(phasors) == 3 else (phasors[0], _ABSENT)
 
     def reads_like(self, other: Binding) -> bool:
         """Whether both make the same sample of every frame."""
@@ -54,12 +78,6 @@ class Binding:
             other.voltage,
             *_meaning(other.layout),
         )
-
-    def voltages(self, data: Data) -> tuple[complex, complex]:
-        """Positive- and negative-sequence voltage, V RMS; the latter NaN where the phases are not given."""
-        if len(self.voltage) == 1:
-            return data.phasor(self.voltage[0]), _ABSENT
-        return sequences(*map(data.phasor, self.voltage))
 
 
 class Reading(NamedTuple):
@@ -127,7 +145,16 @@ def bind(
         if chosen.phasors[channels.index(wanted)].kind != "V":
             raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
         columns.append(first + channels.index(wanted))
-    return Binding(name, config, layout_of(config), index, tuple(columns))
+    layout = layout_of(config)
+    return Binding(name, config, layout, index, tuple(columns), _places(layout, columns))
+
+
+def _places(layout: Layout, columns: Iterable[int]) -> tuple[int, ...]:
+    """Where the phasors' magnitudes are, if all are polar floats that mean what they say."""
+    slots = [layout.phasors[column] for column in columns]
+    if all(slot.polar and slot.floating and slot.factor == 1 and not slot.angle_offset_rad for slot in slots):
+        return tuple(slot.first for slot in slots)
+    return ()
 
 
 def _station(name: str, config: StreamConfig, station: str | None) -> int:

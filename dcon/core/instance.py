@@ -63,12 +63,12 @@ def median_mhz(last: Sequence[Instance], found: Sequence[tuple[int, float] | Non
 
 def update(
     params: Params, supervisor: Supervisor, tables: Tables, last: Sequence[Instance], pmus: Sequence[Pmu], now_ns: int
-) -> tuple[Instance, ...]:
-    """All instances after their PMUs' tick."""
+) -> tuple[tuple[Instance, ...], bool]:
+    """All instances after their PMUs' tick, and whether nothing about them is new but their numbers."""
     if tables.quick is not None:
         uneventful = next_instances(tables.quick, params.instances, last, pmus, supervisor.disabling, now_ns)
         if uneventful is not None:
-            return uneventful
+            return uneventful, True
     faulty = [bool(pmu.raised & supervisor.disabling) for pmu in pmus]
     found = [
         None if faulty[north] or faulty[south] else difference(pmus[north], pmus[south], params.align)
@@ -84,7 +84,7 @@ def update(
         else:
             view = PairView(pmus[pair.north], pmus[pair.south], new[1], middle, now_ns)
             after.append(_updated(params, supervisor, tables, old, new[0], view))
-    return tuple(after)
+    return tuple(after), False
 
 
 def _faults(params: Params, supervisor: Supervisor, pair: Pair, pmus: Sequence[Pmu]) -> str:

@@ -143,8 +143,8 @@ def next_instances(
         newest.append(pmu.ring[0])
     after = []
     least, most = math.inf, -math.inf
-    for (north, south), (state, verified, slot_before, _, reason, _, _, _) in zip(pairs, last, strict=True):
-        if (state is not _READY and state is not _HELD) or slot_before is None or slot <= slot_before:
+    for (north, south), (state, verified, slot_before, _, reason, raised, _, _) in zip(pairs, last, strict=True):
+        if raised or (state is not _READY and state is not _HELD) or slot_before is None or slot <= slot_before:
             return None
         delta_f_mhz = (newest[north] - newest[south]) * 1e3
         if delta_f_mhz < least:

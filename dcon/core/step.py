@@ -55,8 +55,8 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
             for site, last, samples, lost in zip(params.pmus, state.pmus, inputs.samples, unread, strict=True)
         ]
     )
-    instances = instances_of.update(params, supervisor, tables, state.instances, pmus, now_ns)
-    ready = sum([instance.is_ready for instance in instances])
+    instances, quiet = instances_of.update(params, supervisor, tables, state.instances, pmus, now_ns)
+    ready = len(instances) if quiet else sum([instance.is_ready for instance in instances])
     active = instances_of.choose(params, instances, state.active, keep=state.system in DRIVING)
     gain = approach(state.gain_mw_per_mhz, state.target_gain_mw_per_mhz, params.gain_ramp_per_s / params.tick_hz)
     own_mw = _own_mw(params, instances, gain)
@@ -79,7 +79,9 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
     raised, held, evidence = judge(rows, state.held, (params, view))
 
     events: list[Event] = []
-    flags = _changed_flags(params, supervisor, tables, state, pmus, instances, now_ns, events)
+    flags = _changed_pmus(params, supervisor, tables, state, pmus, now_ns, events)
+    if not quiet:
+        flags = _changed_instances(params, supervisor, tables, state, instances, flags, now_ns, events)
     if active != state.active and active is not None:
         events.append(Event("selected", params.instance_names[active]))
     flags = _compared(supervisor, tables, flags, SYSTEM, state.raised, raised, evidence, now_ns)
@@ -191,24 +193,35 @@ _INSTANCE_EVENTS = {
 }
 
 
-def _changed_flags(
+def _changed_pmus(
     params: Params,
     supervisor: Supervisor,
     tables: Tables,
     last: State,
     pmus: Sequence[Pmu],
-    instances: Sequence[Instance],
     now_ns: int,
     events: list[Event],
 ) -> Register:
-    """The register after what PMUs and instances show; checks that rose and changes of state become events."""
+    """The register after what PMUs show; checks that rose become events."""
     flags = last.flags
     for site, before, pmu in zip(params.pmus, last.pmus, pmus, strict=True):
         if pmu.raised != before.raised:
             events.extend(Event(name, site.name) for name in supervisor.named(pmu.raised & ~before.raised))
             flags = _compared(supervisor, tables, flags, site.name, before.raised, pmu.raised, pmu.evidence, now_ns)
-    if instances is last.instances:
-        return flags
+    return flags
+
+
+def _changed_instances(
+    params: Params,
+    supervisor: Supervisor,
+    tables: Tables,
+    last: State,
+    instances: Sequence[Instance],
+    flags: Register,
+    now_ns: int,
+    events: list[Event],
+) -> Register:
+    """The register after what instances show; checks that rose and changes of state become events."""
     for name, old, new in zip(params.instance_names, last.instances, instances, strict=True):
         if new.raised != old.raised:
             events.extend(Event(check, name) for check in supervisor.named(new.raised & ~old.raised))
