@@ -53,6 +53,9 @@ class Platform:
     """Ticks are this long after each 1/60 s of UTC."""
     fifo: bool = field(default=True, metadata=parsed_by(boolean))
     """Ask for the FIFO scheduling policy; without the privilege the loop runs on, with a warning."""
+    judge_overruns: bool = field(default=False, metadata=parsed_by(boolean))
+    """Tell the checks of ticks that were not done in time: one warns, three in a second trip. An ordinary machine
+    pauses now and then, and the loop makes up for it; a real-time system must not pause."""
     gps_required: bool = field(default=False, metadata=parsed_by(boolean))
     """The GPS lock of the controller's clock must be known: without it no arming, and a loss disarms."""
 

@@ -53,7 +53,7 @@ class Bands(NamedTuple):
     """What the command is looked at through."""
 
     ringing: Band
-    """Fourth order below, so that a saturated swing's harmonics stay out, second above."""
+    """Fourth order below, second above."""
     swing: Band
     forget: float
     """Weight of a tick in the mean square of the ringing (a time constant of 0.5 s)."""

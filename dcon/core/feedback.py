@@ -39,13 +39,17 @@ class Feedback(NamedTuple):
 QUIET: Final = Feedback()
 
 
-def watched(params: Params, last: Feedback, command_mw: float) -> Feedback:
-    """The memory after a tick in ACTIVE with ``command_mw``."""
+def watched(params: Params, last: Feedback, command_mw: float, asked_mw: float) -> Feedback:
+    """The memory after a tick in ACTIVE with ``command_mw``.
+
+    ``asked_mw`` is what the control law asked for before any limit: a swing that saturates has harmonics in the band
+    of ringing, and does not ring.
+    """
     limits, bands, tick_hz = params.thresholds, params.bands, params.tick_hz
     ticks = last.ticks + 1
     window = (1 << round(limits.saturation_s * tick_hz)) - 1
     at_limit = abs(command_mw) >= params.limit_mw > 0
-    ring_mw, ringing = passed(bands.ringing, last.ringing, command_mw) if bands.ringing else (0.0, ())
+    ring_mw, ringing = passed(bands.ringing, last.ringing, asked_mw) if bands.ringing else (0.0, ())
     swing_mw, swing = passed(bands.swing, last.swing, command_mw) if bands.swing else (0.0, ())
     half_mw, peaks = last.half_mw, last.peaks_mw
     if swing_mw * half_mw < 0:

@@ -16,7 +16,7 @@ from dcon.core import pmu as pmus_of
 from dcon.core.checks import Supervisor, SystemView, Tables, judge, which
 from dcon.core.command import NONE, Command, form
 from dcon.core.differentiator import wrap
-from dcon.core.feedback import QUIET, watched
+from dcon.core.feedback import QUIET, Feedback, watched
 from dcon.core.law import Transfer, approach, command_mw
 from dcon.core.orders import SYSTEM, Ordered, is_stop, moved, obey
 from dcon.core.params import Params
@@ -135,7 +135,7 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
         held,
         command.driven_mw,
         command.probe,
-        watched(params, state.feedback, command.command_mw) if system is SystemState.ACTIVE else QUIET,
+        _watched(params, state, command, instances, active, gain) if system is SystemState.ACTIVE else QUIET,
         angle_deg,
         overruns,
         flags,
@@ -150,6 +150,14 @@ def _own_mw(params: Params, instances: Sequence[Instance], gain: float) -> list[
         0.0 if instance.state is _DISABLED else command_mw(instance.delta_f_mhz, gain, deadband_mhz, limit_mw)
         for instance in instances
     ]
+
+
+def _watched(
+    params: Params, state: State, command: Command, instances: Sequence[Instance], active: int | None, gain: float
+) -> Feedback:
+    delta_f_mhz = 0.0 if active is None else instances[active].delta_f_mhz
+    asked_mw = command_mw(delta_f_mhz, gain, params.deadband_mhz, math.inf)
+    return watched(params, state.feedback, command.command_mw, asked_mw)
 
 
 def _angle_deg(params: Params, pmus: Sequence[Pmu], active: int) -> float:

@@ -42,7 +42,7 @@ def saturation(params: Params, view: SystemView) -> float:
 
 
 def ringing(_params: Params, view: SystemView) -> float:
-    """RMS of the command from ``ringing_low_hz`` to ``ringing_high_hz``."""
+    """RMS of the command, before its limit, from ``ringing_low_hz`` to ``ringing_high_hz``."""
     return feedback.ringing_mw(view.feedback)
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, Trigger
-from dcon.core.values import Order, SystemState
+from dcon.core.values import NOTHING, Order, SystemState
 from dcon.drivers.udp_command import UdpCommandDriver
 from dcon.engine import Engine, Tick
 from dcon.platform.orders import OrderBook, TimedOrder
@@ -150,6 +150,7 @@ class Platform:
         grid = TickGrid(self.settings.params.tick_hz, round(self.settings.platform.phase_ms * 1e6))
         offset = utc_offset(clock)
         index = grid.after(clock.realtime_ns())
+        told = NOTHING
         while True:
             tick_ns = grid.time_ns(index)
             ending = self.stopping or self._log_failure is not None or (end_ns is not None and tick_ns > end_ns)
@@ -161,7 +162,7 @@ class Platform:
             orders = book.due(tick_ns)
             if ending:
                 orders = () if self.engine.state.system is SystemState.RAMPDOWN else _DISARM
-            tick = self.engine.tick(self._arrived(tick_ns), orders, tick_ns)
+            tick = self.engine.tick(self._arrived(tick_ns), orders, tick_ns, told)
             if self.driver is not None:
                 self.driver.send(tick_ns, tick.record.output_v)
             done_ns = clock.monotonic_ns()
@@ -172,6 +173,8 @@ class Platform:
             summary.late_over_1ms += started_ns - deadline_ns > 1_000_000
             summary.caught_up_ticks += started_ns >= offset.monotonic_ns(grid.time_ns(index + 1))
             index += 1
+            if self.settings.platform.judge_overruns:
+                told = NOTHING._replace(overrun=done_ns >= offset.monotonic_ns(grid.time_ns(index)))
             if summary.ticks % CLOCK_CHECK_TICKS == 0:
                 offset = self._follow_utc(offset)
             index = self._next(grid, index, offset)
