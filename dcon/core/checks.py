@@ -153,7 +153,7 @@ def judge(
             if count < need:
                 continue
         raised |= bit
-        found += ((bit, value),)
+        found += ((bit, float(value)),)
     if counts:
         return raised, tuple(counts.get(at, 0) for at in range(1 + max(row.held for row in rows))), found
     return raised, (), found

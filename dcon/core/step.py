@@ -84,7 +84,8 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
         flags = _changed_instances(params, supervisor, tables, state, instances, flags, now_ns, events)
     if active != state.active and active is not None:
         events.append(Event("selected", params.instance_names[active]))
-    flags = _compared(supervisor, tables, flags, SYSTEM, state.raised, raised, evidence, now_ns)
+    of_commands = state.raised & supervisor.of_commands
+    flags = _compared(supervisor, tables, flags, SYSTEM, state.raised ^ of_commands, raised, evidence, now_ns)
     ordered = Ordered(state.system, state.mode, state.target_gain_mw_per_mhz, state.probe, flags)
     if inputs.orders:
         arm = ArmView(
@@ -108,9 +109,8 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
         extra |= supervisor.bits["command_invalid"]
     elif command.slewed:
         extra |= supervisor.bits["slew_limited"]
-    if extra or state.raised & supervisor.of_commands:
-        flags = _compared(supervisor, tables, flags, SYSTEM, state.raised & supervisor.of_commands, extra, (), now_ns)
-        raised |= extra
+    flags = _compared(supervisor, tables, flags, SYSTEM, of_commands, extra, (), now_ns)
+    raised |= extra
     if not command.valid:
         system, flags = _supervise(supervisor, system, flags, extra, 0, events)
         command = NONE

@@ -83,7 +83,8 @@ def fresh(slot: int, f: float = 0.0, **fields: object) -> Pmu:
 )
 def test_checks_of_a_pair(north: Pmu, south: Pmu, age_ms: float, want: str) -> None:
     now_ns = max(north.time_ns, south.time_ns) + round(age_ms * MS)
-    ((after,), _) = update(PAIR, CORE, CORE.tables(PAIR), (Instance(InstanceState.READY, 2000),), (north, south), now_ns)
+    last = (Instance(InstanceState.READY, 2000),)
+    ((after,), _) = update(PAIR, CORE, CORE.tables(PAIR), last, (north, south), now_ns)
     assert after.reason == want and (after.state is InstanceState.DISABLED) == bool(want)
     assert after.verified == (0 if want else 2001)
 

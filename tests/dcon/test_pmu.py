@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -12,8 +13,10 @@ from support.streams import MS, START_NS, samples
 
 from dcon.core import pmu as pmus_of
 from dcon.core.params import Params
+from dcon.core.quick import next_frame
 from dcon.core.rows import CORE
 from dcon.core.state import Pmu
+from dcon.core.thresholds import Thresholds
 from dcon.core.values import Sample
 
 PARAMS = Params.paired(("N1",), ("S1",), nominal_kv=500.0)
@@ -215,3 +218,60 @@ def test_an_unseen_lost_frame_would_have_been_a_spike() -> None:
         pmu = update(PARAMS, pmu, (frame,), frame.time_ns + 60 * MS)
         spikes.append(abs(pmu.ring[0] - 0.02) if pmu.ring else 0.0)
     assert max(spikes) == pytest.approx(0.112 * 0.02, rel=0.01)
+
+
+SLOW = replace(CORE, known=((), (), ()))
+KEYS = {
+    "latency_high": "latency_warn_ms",
+    "voltage": "voltage_max_pu",
+    "voltage_step": "voltage_step_pu",
+    "unbalance": "unbalance_max_percent",
+    "angle_step": "angle_step_deg",
+    "frequency": "frequency_max_hz",
+    "rocof": "rocof_max_hz_s",
+    "freq_differs": "freq_max_mhz",
+}
+LIVELY = [
+    frame._replace(
+        v1=frame.v1 * (1 + 1e-3 * math.sin(k)),
+        v2=frame.v1 * 0.01 * math.sin(k + 1),
+        frequency_hz=frame.frequency_hz + 1e-3 * math.sin(3 * k),
+        arrival_ns=frame.arrival_ns + round(1e6 * math.sin(k)),
+    )
+    for k, frame in enumerate(samples(lambda t: 0.01 * math.sin(2.5 * t), 40))
+]
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_the_short_way_passes_nothing_that_a_row_would_not(name: str) -> None:
+    """With the threshold at, and within a hair of, what a frame shows."""
+    row = next(row for row in CORE.frame if row.name == name)
+    last = feed(LIVELY[:-1])
+    new = feed(LIVELY)
+    shown = row.value(PARAMS, PARAMS.pmus[0], last, new, LIVELY[-1])
+    assert shown is not None and shown > 0 and flags(new) == []
+    passed = set()
+    for limit in (shown, *(math.nextafter(shown, to) for to in (0, 9e9)), *(shown * (1 + e) for e in HAIRS)):
+        params = replace(PARAMS, thresholds=Thresholds(**{KEYS[name]: limit}, freq_warn_s=0))
+        now_ns = LIVELY[-1].arrival_ns + 5 * MS
+        quick = CORE.tables(params).quick
+        assert quick is not None
+        short = next_frame(quick, params.pmus[0].base_v, last, LIVELY[-1], now_ns)
+        long = pmus_of.update(params, SLOW, SLOW.tables(params), params.pmus[0], last, LIVELY[-1:], now_ns)
+        passed.add(short is not None)
+        assert short is None or repr(short) == repr(long)
+        assert short is None or limit > shown
+    assert passed == {True, False}
+
+
+HAIRS = (-1e-3, -1e-8, -1e-10, 1e-12, 1e-10, 1e-8, 1e-3)
+
+
+def test_the_short_way_of_a_session_is_that_of_the_tables() -> None:
+    one = other = Pmu()
+    for k, frame in enumerate(LIVELY):
+        now_ns = frame.arrival_ns + 5 * MS
+        given = () if k == 30 else (frame,)
+        one = update(PARAMS, one, given, now_ns)
+        other = pmus_of.update(PARAMS, SLOW, SLOW.tables(PARAMS), PARAMS.pmus[0], other, given, now_ns)
+        assert repr(one) == repr(other)
