@@ -11,12 +11,12 @@ import pytest
 from support.streams import ARM, play, samples, ticks
 
 from dcon.core.checks import Action, Check, Scope, SystemValue
-from dcon.core.params import Params
+from dcon.core.params import Line, Params, Required
 from dcon.core.rows import CORE
 from dcon.core.state import Instance, State, initial_state
 from dcon.core.step import step
-from dcon.core.system import ORDERS, TRANSITIONS, Trigger
-from dcon.core.values import Event, Inputs, InstanceState, Mode, Order, Record, SystemState
+from dcon.core.system import ORDERS, PERMISSIVES, TRANSITIONS, ArmView, Trigger, refusal
+from dcon.core.values import Event, Inputs, InstanceState, Mode, Order, Pdci, Record, Surroundings, SystemState
 
 S = SystemState
 PAIR = Params.paired(("N1",), ("S1",), nominal_kv=500.0, deadband_mhz=0.0)
@@ -32,6 +32,10 @@ def at(state: SystemState, mode: Mode = Mode.CLOSED_LOOP) -> State:
     command_mw = 45.0 if state in (S.ACTIVE, S.RAMPDOWN) else 0.0
     driven_mw = command_mw if mode is Mode.CLOSED_LOOP else 0.0
     return READY._replace(system=state, mode=mode, command_mw=command_mw, driven_mw=driven_mw)
+
+
+def told(view: ArmView, **changed: Any) -> ArmView:
+    return view._replace(surroundings=view.surroundings._replace(**changed))
 
 
 def tick(state: State, *orders: Order, window: int = 20) -> tuple[State, Record]:
@@ -67,6 +71,88 @@ def test_every_state_with_every_order(state: SystemState, order: str) -> None:
         assert after.system is record.state is want
     if record.state not in (S.ACTIVE, S.RAMPDOWN):
         assert record.command_mw == 0.0 and record.output_v == 0.0
+
+
+CHECKED = {
+    "warn": (Surroundings(server_age_s=9.0), {}),
+    "disarm": (Surroundings(gps_age_s=9.0), {S.ARMED: S.STANDBY, S.ACTIVE: S.RAMPDOWN}),
+    "trip": (Surroundings(watchdog_healthy=False), {state: S.FAULT for state in S if state is not S.ESTOP}),
+    "estop": (Surroundings(estop_released=False), dict.fromkeys(S, S.ESTOP)),
+    "trip and estop": (Surroundings(watchdog_healthy=False, estop_released=False), dict.fromkeys(S, S.ESTOP)),
+}
+
+
+@pytest.mark.parametrize("state", list(S))
+@pytest.mark.parametrize("action", CHECKED)
+def test_every_state_with_every_action_of_a_check(state: SystemState, action: str) -> None:
+    """Only what moved the system is latched; what is driven is 0 at once after a trip, and ramps otherwise."""
+    told, moves = CHECKED[action]
+    before = at(state)
+    if state is S.INIT:
+        before = before._replace(instances=(Instance(),), pmus=initial_state(PAIR).pmus)
+        samples_: Any = ((), ())
+    else:
+        samples_ = WINDOWS[20][0].samples
+    after, record = step(PAIR, before, Inputs(samples_, (), told), WINDOWS[20][1])
+    assert record.state is moves.get(state, state)
+    latched = {flag.name for flag in after.flags.values() if flag.latched}
+    own = {"server", "gps", "watchdog", "estop"} & {flag.name for flag in after.flags.values()}
+    assert latched == (own if record.state is not state else set()) or action == "trip and estop"
+    if record.state is S.RAMPDOWN:
+        assert record.command_mw >= 45.0 - 1000 / 60 - 1e-9
+    elif record.state is not S.ACTIVE:
+        assert record.command_mw == 0.0 == record.output_v or state is S.RAMPDOWN
+
+
+LINE = Pdci(WINDOWS[20][1], 1500.0)
+WELL = ArmView(
+    1,
+    0.0,
+    Surroundings(gps_age_s=0.0, watchdog_healthy=True, estop_released=True, pdci=LINE, server_age_s=0.0),
+    WINDOWS[20][1],
+)
+PERMITTED: dict[str, list[tuple[ArmView, bool]]] = {
+    "ready_instances": [(WELL._replace(ready=0), False)],
+    "command_small": [(WELL._replace(command_mw=mw), abs(mw) <= 62.5) for mw in (62.5, -62.5, 62.6, -62.6)],
+    "gps_locked": [(told(WELL, gps_age_s=age), age == 0) for age in (0.0, 0.1)],
+    "watchdog_healthy": [(told(WELL, watchdog_healthy=False), False)],
+    "estop_released": [(told(WELL, estop_released=False), False)],
+    "server_there": [(told(WELL, server_age_s=age), age <= 2) for age in (2.0, 2.1)],
+    "line_takes_it": [
+        (told(WELL, pdci=LINE._replace(in_service=False)), False),
+        (told(WELL, pdci=LINE._replace(dcon_enabled=False)), False),
+    ],
+    "line_has_room": [(told(WELL, pdci=LINE._replace(power_mw=mw)), mw == 435.0) for mw in (435.0, 434.0, 3200.0)],
+    "acknowledged": [(WELL._replace(latched=("gps",)), False)],
+}
+
+
+def test_every_permissive() -> None:
+    assert [row.name for row in PERMISSIVES] == list(PERMITTED)
+    for row in PERMISSIVES:
+        assert row.test(PAIR, WELL)
+        for view, want in PERMITTED[row.name]:
+            assert row.test(PAIR, view) is want, row.name
+            others = [other.name for other in PERMISSIVES if other is not row and not other.test(PAIR, view)]
+            assert not others
+            for trigger in (Trigger.ARM, Trigger.ACTIVATE):
+                state = S.STANDBY if trigger is Trigger.ARM else S.ARMED
+                assert refusal(PAIR, state, trigger, view) == ("" if want else row.text)
+
+
+def test_what_is_not_fitted_permits_unless_it_is_required() -> None:
+    bare = ArmView(1, 0.0)
+    strict = replace(PAIR, required=Required(True, True, True), line=Line(required=True))
+    refused = {row.name for row in PERMISSIVES if not row.test(strict, bare)}
+    assert refused == {
+        "gps_locked",
+        "watchdog_healthy",
+        "estop_released",
+        "server_there",
+        "line_takes_it",
+        "line_has_room",
+    }
+    assert all(row.test(PAIR, bare) for row in PERMISSIVES)
 
 
 @pytest.mark.parametrize("state", list(S))
