@@ -68,9 +68,7 @@ def bands_of(limits: Thresholds, tick_hz: int) -> Bands:
             *(high_pass(limits.ringing_low_hz, tick_hz, q) for q in _Q4),
             low_pass(min(limits.ringing_high_hz, highest), tick_hz),
         )
-    swing: Band = ()
-    if limits.growth_low_hz < min(limits.growth_high_hz, highest):
-        swing = (high_pass(limits.growth_low_hz, tick_hz), low_pass(min(limits.growth_high_hz, highest), tick_hz))
+    swing = (high_pass(limits.growth_low_hz, tick_hz), low_pass(min(limits.growth_high_hz, highest), tick_hz))
     return Bands(ringing, swing, 1 - math.exp(-1 / (0.5 * tick_hz)))
 
 
