@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import commands, controller, impairments, live, measures, player, streams, structure, studies
+from generate import commands, controller, impairments, matrix, measures, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
@@ -13,6 +13,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     **player.GENERATORS,
     **live.GENERATORS,
     **controller.GENERATORS,
+    **matrix.GENERATORS,
     **measures.GENERATORS,
     **studies.GENERATORS,
     **commands.GENERATORS,

@@ -30,8 +30,8 @@ Make = Callable[..., Bench]
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
-    def make(items: Iterable[tuple[int, Item]] = (), name: str = "s.mcap") -> Bench:
-        return virtual_platform(tmp_path / name, items, monkeypatch)
+    def make(items: Iterable[tuple[int, Item]] = (), name: str = "s.mcap", platform: str = "") -> Bench:
+        return virtual_platform(tmp_path / name, items, monkeypatch, platform)
 
     return make
 
@@ -72,6 +72,22 @@ def test_a_pause_of_the_machine_changes_no_record(pause_s: float, bench: Make) -
     assert summary.skipped_ticks == 0
     assert identical(tuple(quiet.records), tuple(paused.records))
     paused.ended_well()
+
+
+@pytest.mark.parametrize(("pauses", "state"), [(2, "ACTIVE"), (3, "FAULT")])
+def test_late_ticks_warn_and_three_in_a_second_trip_where_that_is_asked_for(
+    pauses: int, state: str, bench: Make
+) -> None:
+    """A pause that makes one tick late; the trip replays like everything else."""
+    made = bench(stream(3), platform="judge_overruns = yes\n")
+    for number in range(pauses):
+        made.clock.pause(1.7 + 0.2 * number, 0.02)
+    made.run(2.6)
+    ending = next(record for record in made.records if record.tick_ns >= START_NS + round(2.5 * NS))
+    assert ending.state == state
+    rose = [event.name for record in made.records for event in record.events if event.name.startswith("overrun")]
+    assert rose == ["overrun"] * pauses + ["overruns"] * (state == "FAULT")
+    made.ended_well()
 
 
 def test_a_long_pause_is_not_made_up_for(bench: Make) -> None:

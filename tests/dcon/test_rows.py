@@ -29,6 +29,73 @@ def test_every_row_that_is_not_the_engines_is_judged() -> None:
     assert len(CORE.names) <= 64
 
 
+INF = math.inf
+DESIGN = {
+    "stamp_step": ("pmu", "disable"),
+    "stale_frame": ("pmu", "warn"),
+    "interpolated": ("pmu", "warn"),
+    "unread_frame": ("pmu", "warn"),
+    "slew_limited": ("system", "warn"),
+    "command_invalid": ("system", "trip"),
+    "internal_error": ("system", "trip"),
+    "not_finite": ("pmu", "disable", -INF, 0.0, 1),
+    "stat_error": ("pmu", "disable", -INF, 0.0, 1),
+    "not_synchronised": ("pmu", "disable", -INF, 0.0, 1),
+    "config_change": ("pmu", "disable", -INF, 0.0, 1),
+    "time_quality": ("pmu", "disable", -INF, 100.0, 1),
+    "latency_high": ("pmu", "warn", -INF, 90.0, 1),
+    "latency": ("pmu", "disable", -5.0, 200.0, 1),
+    "voltage": ("pmu", "disable", 0.8, 1.2, 1),
+    "voltage_step": ("pmu", "disable", -INF, 0.1, 1),
+    "unbalance": ("pmu", "disable", -INF, 5.0, 60),
+    "angle_step": ("pmu", "disable", -INF, 5.0, 1),
+    "frequency": ("pmu", "disable", -INF, 1.0, 1),
+    "rocof": ("pmu", "disable", -INF, 5.0, 1),
+    "freq_differs": ("pmu", "warn", -INF, 20.0, 30),
+    "freq_wrong": ("pmu", "disable", -INF, 20.0, 120),
+    "frozen": ("pmu", "disable", -INF, 2.0, 5),
+    "no_data": ("pmu", "warn", -INF, 0.0, 1),
+    "arrival_gap": ("pmu", "disable", -INF, 50.0, 1),
+    "alignment_age": ("instance", "disable", -INF, 200.0, 1),
+    "alignment_skew": ("instance", "disable", -INF, 8.0, 1),
+    "stamps_differ": ("instance", "disable", -INF, 0.0, 1),
+    "off_median": ("instance", "disable", -INF, 3.0, 30),
+    "no_ready_instance": ("system", "disarm", 1.0, INF, 1),
+    "frequency_difference": ("system", "disarm", -INF, 200.0, 1),
+    "angle_difference": ("system", "disarm", -INF, 120.0, 1),
+    "slipping": ("system", "disarm", -INF, 0.0, 1),
+    "saturation": ("system", "disarm", -INF, 50.0, 1),
+    "ringing": ("system", "disarm", -INF, 10.0, 120),
+    "growing": ("system", "disarm", -INF, 1.5, 1),
+    "bias": ("system", "warn", -INF, 25.0, 1),
+    "overrun": ("system", "warn", -INF, 0.0, 1),
+    "overruns": ("system", "trip", -INF, 2.0, 1),
+    "readback": ("system", "trip", -INF, 2.0, 3),
+    "gps": ("system", "disarm", -INF, 5.0, 1),
+    "watchdog": ("system", "trip", 1.0, INF, 1),
+    "estop": ("system", "estop", 1.0, INF, 1),
+    "line_out": ("system", "disarm", 1.0, INF, 1),
+    "line_refuses": ("system", "disarm", 1.0, INF, 1),
+    "line_window": ("system", "disarm", 0.0, INF, 1),
+    "response_gain": ("system", "warn", 0.7, 1.3, 1),
+    "response_lag": ("system", "warn", -INF, 60.0, 1),
+    "response_gain_lost": ("system", "disarm", 0.7, 1.3, 600),
+    "response_lag_lost": ("system", "disarm", -INF, 60.0, 600),
+    "server": ("system", "warn", -INF, 2.0, 1),
+    "disk": ("system", "warn", 10.0, INF, 1),
+}
+"""Every check with its scope, action, bounds, and frames or ticks at 60/s: what the design asks for, written out."""
+
+
+def test_the_table_is_that_of_the_design() -> None:
+    shown = {}
+    for row in CORE.rows:
+        judged = JUDGED.get(CORE.bits[row.name])
+        bounds = () if judged is None else (judged.low, judged.high, judged.need)
+        shown[row.name] = (str(row.scope), str(row.action), *bounds)
+    assert list(shown.items()) == list(DESIGN.items())
+
+
 @pytest.mark.parametrize("name", [row.name for row in CORE.rows if row.value is not None])
 def test_a_row_is_down_at_its_bounds_and_up_beyond_them(name: str) -> None:
     row = JUDGED[CORE.bits[name]]

@@ -132,14 +132,15 @@ def stream(seconds: float, names: Iterable[str] = STREAMS.streams) -> list[tuple
 class Bench:
     """A platform on a script."""
 
-    def __init__(self, path: Path, items: Iterable[tuple[int, Item]]) -> None:
+    def __init__(self, path: Path, items: Iterable[tuple[int, Item]], platform: str = "") -> None:
         self.path = path
         self.clock = Clock()
         self.script = Script(self.clock)
         self.script.play(items)
         self.driver = Driver(self.clock)
         self.platform = Platform(
-            STREAMS.settings(extra="\n[output]\nurl = udp://127.0.0.1:9\n[platform]\nfifo = no\n"), clock=self.clock
+            STREAMS.settings(extra=f"\n[output]\nurl = udp://127.0.0.1:9\n[platform]\nfifo = no\n{platform}"),
+            clock=self.clock,
         )
 
     def run(self, duration_s: float | None, orders: Sequence[TimedOrder] = ORDERS) -> Summary:
@@ -160,11 +161,14 @@ class Bench:
         assert (result.different, result.stopped) == (0, ""), str(result.first)
 
 
-def virtual_platform(path: Path, items: Iterable[tuple[int, Item]], monkeypatch: pytest.MonkeyPatch) -> Bench:
+def virtual_platform(
+    path: Path, items: Iterable[tuple[int, Item]], monkeypatch: pytest.MonkeyPatch, platform: str = ""
+) -> Bench:
+    """``platform`` are more lines of ``[platform]``."""
     monkeypatch.setattr(loop, "Receivers", lambda endpoints, clock: Script(clock))
     monkeypatch.setattr(loop, "UdpCommandDriver", lambda endpoint: None)
     monkeypatch.setattr(loop, "prepare", lambda *, fifo: None)
-    made = Bench(path, items)
+    made = Bench(path, items, platform)
     made.platform.receivers = made.script  # type: ignore[assignment]
     made.platform.driver = made.driver  # type: ignore[assignment]
     return made
