@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,6 +32,8 @@ class Binding:
     """Columns of V1, or of VA, VB and VC."""
     places: tuple[int, ...]
     """Of their magnitudes among a frame's values, where all are polar floats as they stand; else empty."""
+    whole: tuple[int, ...]
+    """The same of all phasors, where the frame is one station and has nothing but such phasors; else empty."""
 
     def read(self, frame: Frame) -> Reading | None:
         """A data frame as the controller sees it; None where it is not of this configuration."""
@@ -58,17 +60,7 @@ class Binding:
 
     def _voltages(self, data: Data) -> tuple[complex, complex]:
         """Positive- and negative-sequence voltage, V RMS; the latter NaN where the phases are not given."""
-        if self.places:
-            values, rect = data.values, cmath.rect
-            try:
-                phasors = [rect(values[place], values[place + 1]) for place in self.places]
-            except ValueError:  # an infinite angle
-                pass
-            else:
-                found = sequences(*phasors) if len(phasors) == 3 else (phasors[0], _ABSENT)
-                if cmath.isfinite(found[0]):
-                    return found
-        phasors = list(map(data.phasor, self.voltage))
+        phasors = _polar(data, self.places) or list(map(data.phasor, self.voltage))
         return sequences(*phasors) if len(phasors) == 3 else (phasors[0], _ABSENT)
 
     def reads_like(self, other: Binding) -> bool:
@@ -90,8 +82,33 @@ class Reading(NamedTuple):
 
     def entry(self) -> PmuFrame:
         """The frame as a log entry."""
-        name, station = self.binding.name, self.binding.station
-        return pmu_frame(name, self.frame, self.data, station=station, v1=self.sample.v1)
+        binding, frame, data, sample = self
+        if phasors := _polar(data, binding.whole):
+            return PmuFrame(
+                binding.name,
+                bytes(frame.data),
+                sample.time_ns,
+                frame.arrival_ns,
+                frame.stamp_source,
+                sample.stat,
+                sample.time_quality,
+                sample.frequency_hz,
+                data.rocof(),
+                sample.v1,
+                tuple(phasors),
+                time_base=sample.time_base,
+            )
+        return pmu_frame(binding.name, frame, data, station=binding.station, v1=sample.v1)
+
+
+def _polar(data: Data, places: Sequence[int]) -> list[complex]:
+    """Phasors that are polar floats, as ``data.phasor`` gives them; none where one is 0 or not finite: that decides."""
+    values, rect = data.values, cmath.rect
+    try:
+        phasors = [rect(values[place], values[place + 1]) for place in places]
+    except ValueError:  # an infinite angle
+        return []
+    return phasors if all(phasors) and cmath.isfinite(sum(phasors)) else []
 
 
 def _meaning(layout: Layout) -> tuple[object, ...]:
@@ -146,7 +163,10 @@ def bind(
             raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
         columns.append(first + channels.index(wanted))
     layout = layout_of(config)
-    return Binding(name, config, layout, index, tuple(columns), _places(layout, columns))
+    slots = layout.slots
+    alone = len(slots) == 1 and not slots[0].analog_columns and not slots[0].digitals
+    whole = _places(layout, slots[0].phasor_columns) if alone else ()
+    return Binding(name, config, layout, index, tuple(columns), _places(layout, columns), whole)
 
 
 def _places(layout: Layout, columns: Iterable[int]) -> tuple[int, ...]:

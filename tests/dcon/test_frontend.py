@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import cmath
 import math
+import struct
 from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from support.swing import START_NS, some
 
 from dcon.frontend import bind
+from dcon.session.replay import identical
 from pmutools.c37118 import Frame, PhasorChannel, StreamConfig
+from pmutools.c37118.checksum import sealed
 from pmutools.errors import SettingsError
 from pmutools.flow import StampSource
 from pmutools.grid.emulate import EmulatedStream
@@ -122,3 +127,36 @@ def test_bindings_that_read_alike() -> None:
     ):
         assert not one.reads_like(other)
     assert one.reads_like(bind("N1", scaled, rate_hz=60, voltage=PHASES))  # floats have no PHUNIT to scale by
+
+
+NUMBERS = st.one_of(st.floats(width=32), st.sampled_from((0.0, -0.0, math.inf, -math.inf, math.nan, 3.4e38)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(NUMBERS, min_size=12, max_size=12), st.integers(0, 0xFFFF), st.integers(0, 0xFF))
+def test_the_short_way_of_reading_is_the_decoders(numbers: list[float], stat: int, quality: int) -> None:
+    """Any values that float phasors can have, NaN and infinity too: sample and log entry, to the last bit."""
+    stream = EmulatedStream(PMUS[:1], 60)
+    prefix = (0xAA01, stream.config.frame_size, stream.config.idcode, START_NS // 10**9, quality << 24)
+    head = struct.pack(">HHHII", *prefix)
+    data = sealed(head + struct.pack(">H12f", stat, *numbers))
+    binding = bind("N1", stream.config, rate_hz=60, voltage=PHASES)
+    assert len(binding.places) == 3 and len(binding.whole) == 5
+    plain = replace(binding, places=(), whole=())
+    frame_ = Frame(data, START_NS + 60_000_000, StampSource.KERNEL, 0)
+    short, long = binding.read(frame_), plain.read(frame_)
+    assert short is not None and long is not None
+    assert identical(short.sample, long.sample)
+    assert identical(short.entry(), long.entry())
+
+
+def test_negative_sequence_comes_with_three_phases_alone() -> None:
+    stream = EmulatedStream(PMUS[:1], 60)
+    v1, v2 = 288e3 + 0j, 3e3 + 4e3j
+    a = complex(-0.5, math.sqrt(3) / 2)
+    report = Measurement(START_NS, v1 + v2, v1 / a + v2 * a, v1 * a + v2 / a, v1, 0j, 60.0, 0.0)
+    sent = Frame(stream.data_frame([report]), None, StampSource.KERNEL, 0)
+    three, one = (bind("N1", stream.config, rate_hz=60, voltage=v).read(sent) for v in (PHASES, ("V1",)))
+    assert three is not None and one is not None
+    assert three.sample.v1 == pytest.approx(v1, rel=1e-6) and three.sample.v2 == pytest.approx(v2, rel=1e-4)
+    assert one.sample.v1 == pytest.approx(v1, rel=1e-6) and math.isnan(one.sample.v2.real)
