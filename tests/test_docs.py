@@ -350,6 +350,7 @@ def test_commands_named_in_the_text_exist(page: str) -> None:
 
 # --- docstrings --------------------------------------------------------------------------------------------------
 
+
 def definitions(path: Path) -> Iterator[Any]:
     """Public functions and classes of a module."""
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
