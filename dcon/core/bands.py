@@ -56,7 +56,7 @@ class Bands(NamedTuple):
     """Fourth order below, second above."""
     swing: Band
     forget: float
-    """Weight of a tick in the mean square of the ringing (a time constant of 0.5 s)."""
+    """Weight of a tick in the mean square of the ringing."""
 
 
 def bands_of(limits: Thresholds, tick_hz: int) -> Bands:
@@ -69,7 +69,7 @@ def bands_of(limits: Thresholds, tick_hz: int) -> Bands:
             low_pass(min(limits.ringing_high_hz, highest), tick_hz),
         )
     swing = (high_pass(limits.growth_low_hz, tick_hz), low_pass(min(limits.growth_high_hz, highest), tick_hz))
-    return Bands(ringing, swing, 1 - math.exp(-1 / (0.5 * tick_hz)))
+    return Bands(ringing, swing, 1 - math.exp(-1 / (limits.ringing_rms_s * tick_hz)))
 
 
 def passed(band: Band, memory: Memory, value: float) -> tuple[float, Memory]:

@@ -58,9 +58,10 @@ def form(
     if limited.reason == "invalid":
         return Command(valid=False)
     if probe.is_on:
-        stopping = system is not SystemState.ACTIVE
-        ramp_s = min(params.probing.ramp_s, params.transfer_s) if stopping else params.probing.ramp_s
-        probe = advance(probe._replace(stopping=probe.stopping or stopping), params.waveform, ramp_s, params.tick_hz)
+        settings, stopping = params.probing, system is not SystemState.ACTIVE
+        ramp_s = min(settings.ramp_s, params.transfer_s) if stopping else settings.ramp_s
+        probe = probe._replace(stopping=probe.stopping or stopping)
+        probe = advance(probe, params.waveform, ramp_s, settings.slew_mw_per_s, params.tick_hz)
     feedback_mw = limited.mw if mode is Mode.CLOSED_LOOP else 0.0
     shown_mw = saturate(limited.mw + probe.mw, params.limit_mw) - limited.mw
     if not (mode is Mode.CLOSED_LOOP or params.probing.open_loop):

@@ -1,7 +1,7 @@
 """Probing signals: square pulse, multisine, chirp, or a file. A pure function of the ticks since the start.
 
 A signal is worked out before it is needed, as one value a tick. It is added to the command after the control law,
-never judged as feedback, and logged apart. It moves no faster than ``PROBE_SLEW_MW_PER_S``, which leaves the feedback
+never judged as feedback, and logged apart. It moves no faster than ``slew_mw_per_s``, which leaves the feedback
 its share of the slew backstop; so whatever its shape it begins and ends without a step.
 """
 
@@ -14,10 +14,9 @@ from typing import Final, NamedTuple
 
 from dcon.core.law import approach
 from dcon.core.thresholds import check_bounds, setting
-from dcon.limiter import LIMIT_MW
+from dcon.limiter import LIMIT_MW, SLEW_MW_PER_S
 from pmutools.errors import SettingsError
 
-PROBE_SLEW_MW_PER_S: Final = 500.0
 LONGEST_S: Final = 3600.0
 """Of a signal, which bounds its memory."""
 KINDS: Final = ("none", "square", "multisine", "chirp", "file")
@@ -53,6 +52,8 @@ class Probing:
     """Of multisine and chirp."""
     ramp_s: float = setting(1.0, "s", "choice", 0, 60)
     """From nothing to all of the signal, and back."""
+    slew_mw_per_s: float = setting(500.0, "MW/s", "choice: half of the slew backstop", 1, SLEW_MW_PER_S)
+    """How fast the signal may move, whatever its shape."""
     seed: int = setting(1, "", "choice", 0, 2**31)
     """Of the multisine's phases."""
     file: str = ""
@@ -166,7 +167,7 @@ def started(signal: Waveform) -> Probe:
     return Probe(0, 0.0 if signal.ramped else 1.0)
 
 
-def advance(probe: Probe, signal: Waveform, ramp_s: float, tick_hz: int) -> Probe:
+def advance(probe: Probe, signal: Waveform, ramp_s: float, slew_mw_per_s: float, tick_hz: int) -> Probe:
     """``probe`` one tick on; IDLE once the signal is over, or stopped, and has come down to 0."""
     if not probe.is_on:
         return probe
@@ -174,7 +175,7 @@ def advance(probe: Probe, signal: Waveform, ramp_s: float, tick_hz: int) -> Prob
     stopping = probe.stopping or (signal.ramped and probe.tick + ramp_ticks >= signal.ticks)
     step = 1.0 / max(1.0, ramp_ticks)
     level = approach(probe.level, 0.0 if stopping else 1.0, step)
-    mw = approach(probe.mw, level * signal.at(probe.tick), PROBE_SLEW_MW_PER_S / tick_hz)
+    mw = approach(probe.mw, level * signal.at(probe.tick), slew_mw_per_s / tick_hz)
     if mw == 0.0 and (probe.tick >= signal.ticks or (stopping and level == 0.0)):
         return IDLE
     return Probe(probe.tick + 1, level, mw, probe.stopping)

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from dcon import limiter
 from dcon.core import instance as instances_of
 from dcon.core import pmu as pmus_of
-from dcon.core.checks import Supervisor, SystemView, Tables, judge, which
+from dcon.core.changes import changed_instances, changed_pmus, changes, compared
+from dcon.core.checks import Supervisor, SystemView, judge, which
 from dcon.core.command import NONE, Command, form
 from dcon.core.differentiator import wrap
 from dcon.core.feedback import QUIET, Feedback, watched
@@ -21,9 +22,9 @@ from dcon.core.law import Transfer, approach, command_mw
 from dcon.core.orders import SYSTEM, Ordered, is_stop, moved, obey
 from dcon.core.params import Params
 from dcon.core.probe import IDLE
-from dcon.core.register import Register, fallen, latched, risen, with_changes
+from dcon.core.register import Register, latched, risen, with_changes
 from dcon.core.rows import CORE
-from dcon.core.state import Evidence, Instance, Pmu, State
+from dcon.core.state import Instance, Pmu, State
 from dcon.core.system import DRIVING, ArmView, Trigger
 from dcon.core.values import NOTHING, Event, Flag, Inputs, InstanceRecord, InstanceState, Record, SystemState
 
@@ -79,13 +80,13 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
     raised, held, evidence = judge(rows, state.held, (params, view))
 
     events: list[Event] = []
-    flags = _changed_pmus(params, supervisor, tables, state, pmus, now_ns, events)
+    flags = changed_pmus(params, supervisor, tables, state, pmus, now_ns, events)
     if not quiet:
-        flags = _changed_instances(params, supervisor, tables, state, instances, flags, now_ns, events)
+        flags = changed_instances(params, supervisor, tables, state, instances, flags, now_ns, events)
     if active != state.active and active is not None:
         events.append(Event("selected", params.instance_names[active]))
     of_commands = state.raised & supervisor.of_commands
-    flags = _compared(supervisor, tables, flags, SYSTEM, state.raised ^ of_commands, raised, evidence, now_ns)
+    flags = compared(supervisor, tables, flags, SYSTEM, state.raised ^ of_commands, raised, evidence, now_ns)
     ordered = Ordered(state.system, state.mode, state.target_gain_mw_per_mhz, state.probe, flags)
     if inputs.orders:
         arm = ArmView(
@@ -109,7 +110,7 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
         extra |= supervisor.bits["command_invalid"]
     elif command.slewed:
         extra |= supervisor.bits["slew_limited"]
-    flags = _compared(supervisor, tables, flags, SYSTEM, of_commands, extra, (), now_ns)
+    flags = compared(supervisor, tables, flags, SYSTEM, of_commands, extra, (), now_ns)
     raised |= extra
     if not command.valid:
         system, flags = _supervise(supervisor, system, flags, extra, 0, events)
@@ -140,7 +141,7 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
         overruns,
         flags,
     )
-    return after, _record(params, after, command, own_mw, events, _changes(state.flags, flags), now_ns)
+    return after, _record(params, after, command, own_mw, events, changes(state.flags, flags), now_ns)
 
 
 def _own_mw(params: Params, instances: Sequence[Instance], gain: float) -> list[float]:
@@ -194,89 +195,13 @@ def _supervise(
     return system, flags
 
 
-_INSTANCE_EVENTS = {
-    InstanceState.DISABLED: "instance_disabled",
-    InstanceState.INITIALISING: "instance_initialising",
-    InstanceState.READY: "instance_ready",
-}
-
-
-def _changed_pmus(
-    params: Params,
-    supervisor: Supervisor,
-    tables: Tables,
-    last: State,
-    pmus: Sequence[Pmu],
-    now_ns: int,
-    events: list[Event],
-) -> Register:
-    """The register after what PMUs show; checks that rose become events."""
-    flags = last.flags
-    for site, before, pmu in zip(params.pmus, last.pmus, pmus, strict=True):
-        if pmu.raised != before.raised:
-            events.extend(Event(name, site.name) for name in supervisor.named(pmu.raised & ~before.raised))
-            flags = _compared(supervisor, tables, flags, site.name, before.raised, pmu.raised, pmu.evidence, now_ns)
-    return flags
-
-
-def _changed_instances(
-    params: Params,
-    supervisor: Supervisor,
-    tables: Tables,
-    last: State,
-    instances: Sequence[Instance],
-    flags: Register,
-    now_ns: int,
-    events: list[Event],
-) -> Register:
-    """The register after what instances show; checks that rose and changes of state become events."""
-    for name, old, new in zip(params.instance_names, last.instances, instances, strict=True):
-        if new.raised != old.raised:
-            events.extend(Event(check, name) for check in supervisor.named(new.raised & ~old.raised))
-            flags = _compared(supervisor, tables, flags, name, old.raised, new.raised, new.evidence, now_ns)
-        if new.state is not old.state and not (new.is_ready and old.is_ready):
-            events.append(Event(_INSTANCE_EVENTS[new.state], name, new.reason))
-    return flags
-
-
-def _compared(
-    supervisor: Supervisor,
-    tables: Tables,
-    flags: Register,
-    subject: str,
-    before: int,
-    now: int,
-    evidence: Evidence,
-    now_ns: int,
-) -> Register:
-    """The register after a subject's checks went from ``before`` to ``now``."""
-    if before == now:
-        return flags
-    changes = []
-    found = dict(evidence)
-    for name in supervisor.named(now & ~before):
-        bit = supervisor.bits[name]
-        value = found.get(bit, math.nan)
-        low, high = tables.limits.get(bit, (math.nan, math.nan))
-        changes.append(risen(flags, name, subject, now_ns, value, low if value < low else high))
-    gone = [flags.get((name, subject)) for name in supervisor.named(before & ~now)]
-    changes.extend(fallen(flag, now_ns) for flag in gone if flag is not None)
-    return with_changes(flags, changes)
-
-
-def _changes(before: Register, after: Register) -> tuple[Flag, ...]:
-    if after is before:
-        return ()
-    return tuple(flag for key, flag in after.items() if before.get(key) is not flag)
-
-
 def _record(
     params: Params,
     state: State,
     command: Command,
     own_mw: Sequence[float],
     events: Sequence[Event],
-    changes: tuple[Flag, ...],
+    flag_changes: tuple[Flag, ...],
     now_ns: int,
 ) -> Record:
     flags = state.raised
@@ -305,7 +230,7 @@ def _record(
             ]
         ),
         events=tuple(events),
-        flag_changes=changes,
+        flag_changes=flag_changes,
     )
 
 
@@ -331,4 +256,4 @@ def _failed(
     )
     shown = after._replace(pmus=(Pmu(),) * len(after.pmus))  # the input that failed may be anything, now_ns too
     own_mw = (0.0,) * len(after.instances)
-    return after, _record(params, shown, NONE, own_mw, events, _changes(state.flags, flags), now_ns)
+    return after, _record(params, shown, NONE, own_mw, events, changes(state.flags, flags), now_ns)

@@ -97,6 +97,8 @@ class Thresholds:
     """RMS of the feedback command between ``ringing_low_hz`` and ``ringing_high_hz``: disarm above."""
     ringing_s: float = setting(2.0, "s", "choice", 0, 60)
     """For so long."""
+    ringing_rms_s: float = setting(0.5, "s", "choice", 0.05, 10)
+    """Time constant of that mean square."""
     ringing_low_hz: float = setting(1.5, "Hz", "choice: above every inter-area mode", 0.1, 20)
     """Lower edge of the band of ringing."""
     ringing_high_hz: float = setting(8.0, "Hz", "choice: the line may ring near 5 Hz", 0.2, 60)

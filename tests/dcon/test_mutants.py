@@ -17,7 +17,20 @@ import pytest
 from support.mutation import mutants, survivors
 
 from dcon import limiter
-from dcon.core import checks, feedback, instance, line, quick, register, rows, stamps, step, system, system_rows
+from dcon.core import (
+    changes,
+    checks,
+    feedback,
+    instance,
+    line,
+    quick,
+    register,
+    rows,
+    stamps,
+    step,
+    system,
+    system_rows,
+)
 from dcon.core import pmu as pmus_of
 from dcon.core.checks import Judged, PairView, SystemView
 from dcon.core.differentiator import Filter
@@ -623,7 +636,7 @@ def acted(system_: SystemState, raised: int, ready_: int = 0) -> Any:
 
 def compare(before: int, now: int, evidence: Any = ()) -> Any:
     kept = {("latency", "N1"): FLAG._replace(name="latency", subject="N1")}
-    after_ = step._compared(CORE, CORE.tables(PARAMS), kept, "N1", before, now, evidence, 9)
+    after_ = changes.compared(CORE, CORE.tables(PARAMS), kept, "N1", before, now, evidence, 9)
     return sorted((f.name, f.up, f.last_ns, f.value, f.limit) for f in after_.values())
 
 
@@ -678,7 +691,7 @@ ABOUT: dict[Callable[..., Any], tuple[FunctionType, ...]] = {
     watch: (feedback.watched,),
     watch_all: (feedback.watched,),
     acted: (step._supervise,),
-    compare: (step._compared,),
+    compare: (changes.compared,),
     system_rows.growing: (system_rows.growing, feedback.growth),
     system_rows.bias: (system_rows.bias, feedback.bias_mw),
     rows.time_quality: (rows.time_quality, stamps.clock_error_us),
@@ -703,7 +716,7 @@ EQUIVALENT = {
     "next_instances line 24: LtE -> Lt #0": HAIR,
     "margin_mw line 9: GtE -> Gt #0": "at 0 MW the minimum decides, not the rating",
     "watched line 17: Gt -> GtE #0": "the same number in its own place",
-    "_compared line 20: Lt -> LtE #0": "at its bound a row is down, and nothing is compared",
+    "compared line 20: Lt -> LtE #0": "at its bound a row is down, and nothing is compared",
 }
 """Mutants that do what the original does, and why."""
 
