@@ -75,7 +75,8 @@ def compared(
         bit = supervisor.bits[name]
         value = found.get(bit, math.nan)
         low, high = tables.limits.get(bit, (math.nan, math.nan))
-        new.append(risen(flags, name, subject, now_ns, value, low if value < low else high))
+        limit = high if value > high or low == -math.inf else low
+        new.append(risen(flags, name, subject, now_ns, value, limit))
     gone = [flags.get((name, subject)) for name in supervisor.named(before & ~now)]
     new.extend(fallen(flag, now_ns) for flag in gone if flag is not None)
     return with_changes(flags, new)

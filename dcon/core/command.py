@@ -72,7 +72,5 @@ def form(
         driven = limiter.limit(feedback_mw + probe.mw, state.driven_mw, period_s, params.limit_mw)
         if driven.reason == "invalid":
             return Command(valid=False)
-    return Command(
-        *(limited.mw, driven.mw, driven.mw - feedback_mw, probe, transfer, True),
-        "slew" in (limited.reason, driven.reason),
-    )
+    slewed = "slew" in (limited.reason, driven.reason)
+    return Command(limited.mw, driven.mw, driven.mw - feedback_mw, probe, transfer, True, slewed)

@@ -119,14 +119,10 @@ def next_frame(limits: Limits, base_v: float, last: Pmu, sample: Sample, now_ns:
         and abs(f - y) <= freq_max
     ):
         return None
-    return _new(
-        Pmu,
-        (
-            *(slot, time_ns, arrival_ns, time_base, v1, magnitude),
-            *(_new(Filter, (theta, increment, f, f1, 3)), (f, *ring[:_KEPT]), 0, 0),
-            *(_new(Freq, (x, x1, y, y1)), (), ()),
-        ),
-    )
+    turned = _new(Filter, (theta, increment, f, f1, 3))
+    smooth = _new(Freq, (x, x1, y, y1))
+    ring = (f, *ring[:_KEPT])
+    return _new(Pmu, (slot, time_ns, arrival_ns, time_base, v1, magnitude, turned, ring, 0, 0, smooth, (), ()))
 
 
 def next_instances(

@@ -677,6 +677,8 @@ ACTING = [
         ((0, BIT["voltage"], ((BIT["voltage"], 0.7),)), [LAST, ("voltage", True, 9, 0.7, 0.8)]),
         ((BIT["voltage"], BIT["voltage"] | BIT["rocof"], ((BIT["rocof"], 9.0),)), [LAST, ("rocof", True, 9, 9.0, 5.0)]),
         ((BIT["frozen"], 0), [LAST]),
+        ((0, BIT["disk"], ((BIT["disk"], NAN),)), [("disk", True, 9, NAN, 10.0), LAST]),
+        ((0, BIT["rocof"], ((BIT["rocof"], NAN),)), [LAST, ("rocof", True, 9, NAN, 5.0)]),
     ),
 ]
 
@@ -716,7 +718,7 @@ EQUIVALENT = {
     "next_instances line 24: LtE -> Lt #0": HAIR,
     "margin_mw line 9: GtE -> Gt #0": "at 0 MW the minimum decides, not the rating",
     "watched line 17: Gt -> GtE #0": "the same number in its own place",
-    "compared line 20: Lt -> LtE #0": "at its bound a row is down, and nothing is compared",
+    "compared line 20: Gt -> GtE #0": "at its bound a row is down, and nothing is compared",
 }
 """Mutants that do what the original does, and why."""
 
@@ -725,7 +727,7 @@ def same(got: object, want: object) -> bool:
     """Equal, with NaN equal to itself, and floats to rounding."""
     if isinstance(got, float) and isinstance(want, float):
         return (math.isnan(got) and math.isnan(want)) or math.isclose(got, want, rel_tol=1e-9, abs_tol=1e-9)
-    if isinstance(got, tuple) and isinstance(want, tuple):
+    if isinstance(got, tuple | list) and isinstance(want, tuple | list):
         return len(got) == len(want) and all(map(same, got, want))
     return got == want
 
