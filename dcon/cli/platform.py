@@ -62,12 +62,16 @@ def command(
     if as_json:
         click.echo(json.dumps(asdict(summary)))
     talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}; session log {path}")
+    if len(summary.log_parts) > 1:
+        talk.say(f"in {len(summary.log_parts)} parts, the last {summary.log_parts[-1]}")
+    if summary.unlogged_ticks:
+        talk.complain(f"{summary.unlogged_ticks} ticks were not logged")
     if platform.stopping:
         return Exit.INTERRUPTED
     if not summary.frames:
         where = ", ".join(str(site.url) for site in settings.sites)
         raise SourceError(f"no frame came from any PMU ({where}); are they on, and the ports and IDCODEs right?")
-    return Exit.DONE
+    return Exit.INCOMPLETE if summary.unlogged_ticks else Exit.DONE
 
 
 @contextmanager

@@ -16,19 +16,22 @@ from pmutools.errors import SourceError
 
 if TYPE_CHECKING:
     from dcon.core.values import Record
-    from dcon.session.log import LoggedTick
     from dcon.session.replay import Observer
 
 TOLD_TICKS = 3600
 
 
 @click.command(name="replay", short_help="A recorded session through the engine again; commands must be identical.")
-@click.argument("session", metavar="SESSION")
+@click.argument("sessions", metavar="SESSION...", nargs=-1, required=True)
 @click.option("--set", "changes", multiple=True, metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Commands as CSV.")
 @common
-def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: bool, quiet: bool, verbose: int) -> int:
+def command(
+    sessions: tuple[str, ...], changes: tuple[str, ...], out: Path | None, as_json: bool, quiet: bool, verbose: int
+) -> int:
     """Replay a session log, tick by tick, from its logged bytes and arrivals.
+
+    The first part of a session brings those that follow it; or name the parts.
 
     Exit code 3 says that something came out otherwise (without --set), or that the log could not be replayed whole.
     With --set the answer is what the controller would have commanded, not what the grid would have done.
@@ -39,12 +42,12 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
     replayed = itertools.count(1)
     with _commands(out) as write:
 
-        def observe(tick: LoggedTick, now: Record) -> None:
-            write(tick, now)
+        def observe(recorded_mw: float, now: Record) -> None:
+            write(recorded_mw, now)
             if (count := next(replayed)) % TOLD_TICKS == 0:
                 talk.progress(f"{count} ticks")
 
-        result = replay(session, changes, observe)
+        result = replay(sessions, changes, observe)
     talk.progress("")
     if as_json:
         click.echo(json.dumps(result.to_json()))
@@ -68,14 +71,14 @@ def command(session: str, changes: tuple[str, ...], out: Path | None, as_json: b
 def _commands(out: Path | None) -> Iterator[Observer]:
     """Writes one row a tick to ``out``."""
     if out is None:
-        yield lambda tick, now: None
+        yield lambda recorded_mw, now: None
         return
     try:
         with out.open("w", encoding="ascii") as file:
             file.write("tick_ns,recorded_command_mw,replayed_command_mw\n")
 
-            def write(tick: LoggedTick, now: Record) -> None:
-                file.write(f"{now.tick_ns},{tick.record.command_mw!r},{now.command_mw!r}\n")
+            def write(recorded_mw: float, now: Record) -> None:
+                file.write(f"{now.tick_ns},{recorded_mw!r},{now.command_mw!r}\n")
 
             yield write
     except SourceError:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from dataclasses import replace
-from functools import partial
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pmutools.cli.shell import Parsed, Talk, common
-from pmutools.errors import SettingsError, SourceError
+from pmutools.errors import SourceError
 from pmutools.parsers import number
 
 if TYPE_CHECKING:
-    from dcon.sim.plan import Plan
     from dcon.sim.simulate import Outcome
+    from dcon.sim.sweep import Axis, Run
 
-SWEPT = {"gain": "gain_mw_per_mhz", "delay": "delay_ms", "deadband": "deadband_mhz", "seed": "seed"}
-SWEEP_LIMIT = 10_000
+RESULT = "result.json"
 
 
 @click.command(name="simulate", short_help="A scenario in virtual time, through the same bytes and the same engine.")
@@ -37,7 +36,12 @@ SWEEP_LIMIT = 10_000
 @click.option("--interpolate", is_flag=True, help="Bridge single lost frames by their midpoint.")
 @click.option("--duration", type=Parsed(number(1e-3, 86400)), metavar="S", help="Default: until all is seen.")
 @click.option("--seed", type=int, default=1, show_default=True, metavar="N")
-@click.option("--sweep", "sweeps", multiple=True, metavar="NAME=FROM:TO:STEP", help="gain, delay, deadband or seed.")
+@click.option(
+    *("--sweep", "sweeps"),
+    multiple=True,
+    metavar="NAME=FROM:TO:STEP",
+    help="gain, delay, deadband, noise or seed; repeatable: every combination.",
+)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Log the session there.")
 @common
 def command(
@@ -62,10 +66,12 @@ def command(
 ) -> None:
     """Simulate a SCENARIO: grid, PMUs, wire, faults and controller, and judge the ringdown.
 
-    With --sweep, one line a run. With --out, each run leaves its session log there.
+    With --sweep, one row a run, and with --json a list. With --out, each run leaves its session log there, and
+    result.json holds what --json prints.
     """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: for matrices this small threads only cost
     from dcon.sim.plan import Plan
-    from dcon.sim.simulate import simulate
+    from dcon.sim.sweep import outcomes, parse_axis, runs
     from pmutools.impair.profile import Profile
     from pmutools.impair.profiles import load_profile
 
@@ -85,59 +91,64 @@ def command(
         noise_rad=noise / 1e3,
         seed=seed,
     )
-    plans = list(_swept(plan, sweeps))
+    axes = [parse_axis(sweep) for sweep in sweeps]
+    sweep = runs(plan, axes, out)
     if out is not None:
-        try:
+        with _naming(out):
             out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SourceError(f"--out {out}: {error.strerror}") from None
-    for run, each in enumerate(plans, 1):
-        path = None if out is None else str(out / ("session.mcap" if len(plans) == 1 else f"session-{run}.mcap"))
-        outcome = simulate(each, path, partial(_progress, talk, f"run {run} of {len(plans)}"))
-        talk.progress("")
+    results: list[dict[str, Any]] = []
+    for number_, (run, outcome) in enumerate(
+        zip(sweep, outcomes(sweep, lambda now_s: talk.progress(f"{now_s:.0f} s")), strict=True), 1
+    ):
+        talk.progress(f"{number_} of {len(sweep)} runs" if number_ < len(sweep) else "")
+        results.append(_result(run, outcome, axes))
         if as_json:
-            click.echo(json.dumps(outcome.to_json() | ({"session": path} if path else {})))
+            click.echo(("[\n" if number_ == 1 else "") * bool(axes) + json.dumps(results[-1]), nl=False)
+            click.echo(",\n" if number_ < len(sweep) else "\n]\n" if axes else "\n", nl=False)
+        elif axes:
+            click.echo("\n".join(_rows(run, outcome, axes)[number_ > 1 :]))
         else:
-            click.echo(_line(outcome) if len(plans) > 1 else _text(outcome))
-        if path:
-            talk.say(f"session log: {path}")
+            click.echo(_text(outcome))
+    if out is not None:
+        talk.say(f"session log: {sweep[0].path}" if len(sweep) == 1 else f"{len(sweep)} session logs in {out}")
+        with _naming(out):
+            (out / RESULT).write_text(json.dumps(results if axes else results[0], indent=1) + "\n")
 
 
-def _progress(talk: Talk, run: str, now_s: float) -> None:
-    talk.progress(f"{run}: {now_s:.0f} s")
-
-
-def _swept(plan: Plan, sweeps: tuple[str, ...]) -> list[Plan]:
-    axes = [_axis(sweep) for sweep in sweeps]
-    plans = [plan]
-    for name, values in axes:
-        plans = [replace(each, **{name: value}) for each, value in itertools.product(plans, values)]  # type: ignore[arg-type]
-        if len(plans) > SWEEP_LIMIT:
-            raise SettingsError(f"--sweep: more than {SWEEP_LIMIT} runs")
-    return plans
-
-
-def _axis(text: str) -> tuple[str, list[float]]:
-    name, equals, span = text.partition("=")
+@contextmanager
+def _naming(out: Path) -> Iterator[None]:
     try:
-        first, last, step = (float(part) for part in span.split(":"))
-        count = int((last - first) / step + 1e-9) + 1
-    except (ValueError, ZeroDivisionError, OverflowError):
-        equals = ""
-    if not equals or name not in SWEPT or first < 0 or not 0 < count <= SWEEP_LIMIT:
-        raise SettingsError(f"--sweep {text}: write {'|'.join(SWEPT)}=FROM:TO:STEP, as in gain=0:15:3")
-    values = [first + step * number for number in range(count)]
-    return SWEPT[name], [int(value) for value in values] if name == "seed" else values
+        yield
+    except OSError as error:
+        raise SourceError(f"--out {out}: {error.strerror}") from None
 
 
-def _line(outcome: Outcome) -> str:
-    plan, mode = outcome.plan, outcome.mode or outcome.open_loop
-    judged = f"{mode.frequency_hz:.4f} Hz {mode.damping_percent:6.2f} %" if mode else "-"
-    peak = max(map(abs, outcome.command_mw), default=0.0)
-    settings = (
-        f"K {plan.gain_mw_per_mhz:g} delay {plan.delay_ms:g} ms deadband {plan.deadband_mhz:g} mHz seed {plan.seed}"
-    )
-    return f"{settings}: {judged}, peak {peak:.1f} MW, {outcome.final_state}"
+def _result(run: Run, outcome: Outcome, axes: list[Axis]) -> dict[str, Any]:
+    result = outcome.to_json()
+    if axes:
+        result["swept"] = run.swept
+    if run.path:
+        result["session"] = run.path
+    return result
+
+
+def _rows(run: Run, outcome: Outcome, axes: list[Axis]) -> list[str]:
+    """The head of a sweep's table, and the row of one run."""
+    from dcon.sim.sweep import SWEPT
+
+    mode = outcome.mode or outcome.open_loop
+    cells = [(f"{axis.name} {SWEPT[axis.name].unit}".strip(), f"{run.swept[axis.name]:g}") for axis in axes]
+    cells += [
+        ("frequency Hz", f"{mode.frequency_hz:.4f}" if mode else "-"),
+        ("damping %", f"{mode.damping_percent:.2f}" if mode else "-"),
+        ("peak MW", f"{outcome.peak_command_mw:.1f}"),
+        ("final state", outcome.final_state),
+    ]
+    widths = [max(len(name), 8) for name, _ in cells]
+    return [
+        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
+        for row in zip(*cells, strict=True)
+    ]
 
 
 def _text(outcome: Outcome) -> str:
@@ -147,8 +158,7 @@ def _text(outcome: Outcome) -> str:
     for name, mode in (("open loop", outcome.open_loop), ("closed loop", outcome.mode)):
         if mode is not None:
             lines.append(f"  {name:<12} {mode.frequency_hz:.4f} Hz  {mode.damping_percent:6.2f} %  (R² {mode.r2:.4f})")
-    peak = max(map(abs, outcome.command_mw), default=0.0)
-    lines.append(f"  peak command {peak:.1f} MW, final state {outcome.final_state}")
+    lines.append(f"  peak command {outcome.peak_command_mw:.1f} MW, final state {outcome.final_state}")
     lines += [
         f"  {time_s:9.3f} s  {event.name:<22} {event.subject} {event.detail}".rstrip()
         for time_s, event in outcome.events

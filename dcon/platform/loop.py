@@ -4,8 +4,9 @@ One thread: between ticks it receives and parses, at the tick it computes, drive
 the frames that had arrived by its time, and the log says which they were; so a tick that runs late decides what it
 would have decided in time, and ticks that the machine slept through are made up for.
 
-The session ends at its time, when asked to, or when it can no longer be logged: in all three the command ramps to 0
-first, as after an operator's ``disarm``. Anything else that goes wrong ends it at once. The last datagram says 0 V.
+The session ends at its time or when asked to: in both the command ramps to 0 first, as after an operator's ``disarm``.
+Anything else that goes wrong ends it at once, but for a log that the disk has no room for: that is told, and control
+goes on. The last datagram says 0 V.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from dcon.engine import Engine, Tick
 from dcon.platform.orders import OrderBook, TimedOrder
 from dcon.platform.schedule import TickGrid
 from dcon.session.codec import Timing
-from dcon.session.log import SessionWriter
+from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.c37118 import Frame, FrameType, Message, StreamConfig
 from pmutools.clock import Clock, SystemClock, UtcOffset, utc_offset
-from pmutools.errors import SettingsError, SourceError
+from pmutools.errors import SettingsError
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.receiver import Receivers
@@ -78,6 +79,10 @@ class Summary:
     own_drops: int = 0
     unsent: int = 0
     """Commands that the system refused to send, or that nobody listened to."""
+    unlogged_ticks: int = 0
+    """Ticks that the log had no room for."""
+    log_parts: list[str] = field(default_factory=list)
+    """Files of the session log."""
     final_state: str = ""
 
 
@@ -98,7 +103,6 @@ class Platform:
             raise
         self.summary = Summary()
         self.stopping = False
-        self._log_failure: SourceError | None = None
         self._told = Counter[LinkKind]()
         self._frames: dict[str, list[Frame]] = {}
         self._configs: list[tuple[str, bytes, int]] = []
@@ -117,7 +121,7 @@ class Platform:
     ) -> Summary:
         """Run until ``duration_s`` after ``start_ns`` (POSIX UTC; now unless given), or until :meth:`stop`.
 
-        ``orders`` count from ``start_ns``. Raises SourceError where the log cannot be written, SettingsError where a
+        ``orders`` count from ``start_ns``. Raises SourceError where the log cannot be begun, SettingsError where a
         PMU's first configuration cannot be used and no instance is READY yet; later that is an event.
         """
         start_ns = self.clock.realtime_ns() if start_ns is None else start_ns
@@ -125,7 +129,7 @@ class Platform:
         settings = self.settings
         prepare(fifo=settings.platform.fifo)
         try:
-            with SessionWriter(
+            with RollingWriter(
                 log_path,
                 ini_text=settings.text,
                 configs={},
@@ -133,7 +137,8 @@ class Platform:
                 pmus=[site.name for site in settings.sites],
                 instances=settings.params.instance_names,
                 flags=CORE.names,
-                probe_file=settings.probe_file,
+                max_mb=settings.log.max_mb,
+                max_minutes=settings.log.max_minutes,
             ) as writer:
                 self._loop(writer, OrderBook(orders, start_ns), end_ns)
         finally:
@@ -141,11 +146,11 @@ class Platform:
             self._close()
         self.summary.unread = dict(self.engine.unread)
         self.summary.final_state = str(self.engine.state.system)
-        if self._log_failure is not None:
-            raise self._log_failure
+        self.summary.unlogged_ticks = writer.unlogged_ticks
+        self.summary.log_parts = list(map(str, writer.parts))
         return self.summary
 
-    def _loop(self, log: SessionWriter, book: OrderBook, end_ns: int | None) -> None:
+    def _loop(self, log: RollingWriter, book: OrderBook, end_ns: int | None) -> None:
         clock, summary = self.clock, self.summary
         grid = TickGrid(self.settings.params.tick_hz, round(self.settings.platform.phase_ms * 1e6))
         offset = utc_offset(clock)
@@ -153,7 +158,7 @@ class Platform:
         told = NOTHING
         while True:
             tick_ns = grid.time_ns(index)
-            ending = self.stopping or self._log_failure is not None or (end_ns is not None and tick_ns > end_ns)
+            ending = self.stopping or (end_ns is not None and tick_ns > end_ns)
             if ending and self.engine.state.system not in ENGAGED:
                 return
             deadline_ns = offset.monotonic_ns(tick_ns)
@@ -205,17 +210,11 @@ class Platform:
                 (self._frames if later else arrived).setdefault(name, []).append(frame)
         return arrived
 
-    def _write(self, log: SessionWriter, tick: Tick, orders: Sequence[Order], timing: Timing) -> None:
+    def _write(self, log: RollingWriter, tick: Tick, orders: Sequence[Order], timing: Timing) -> None:
         configs, self._configs = self._configs, []
-        if self._log_failure is not None:
-            return
-        try:
-            for name, frame, time_ns in configs:
-                log.config(name, frame, time_ns)
-            log.tick(tick.record, tick.frames, orders, timing=timing, surroundings=tick.surroundings)
-        except SourceError as error:
-            LOG.error("%s; disarming, for nothing unrecorded is driven", error)
-            self._log_failure = error
+        for name, frame, time_ns in configs:
+            log.config(name, frame, time_ns)
+        log.tick(tick.record, tick.frames, orders, timing=timing)
 
     def _receive_until(self, deadline_ns: int) -> None:
         """Receive and parse until shortly before ``deadline_ns``, then wait for it exactly and take what has come."""

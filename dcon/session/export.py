@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dcon.session.log import SessionReader
+from dcon.session.parts import Paths
 from dcon.session.tables import TABLES, Column, Row, Table
 from pmutools.errors import SettingsError, SourceError
 from pmutools.schema.log_reader import Damage
@@ -33,7 +34,7 @@ class ExportSummary(NamedTuple):
     damage: Damage
 
 
-def export(session: str | os.PathLike[str], out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
+def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
     """Write one table of a session log to ``out``: ``.csv .parquet .arrow .jsonl``, text also ``.gz`` or ``.zst``.
 
     Raises SettingsError for a table or suffix that is not known, SourceError where either file cannot be used or (for
@@ -49,7 +50,7 @@ def export(session: str | os.PathLike[str], out: str | os.PathLike[str], table: 
     batches = rows.batches()
     first = next(batches, None)
     if first is None and table == "tick":
-        raise SourceError(f"{session}: holds no tick")
+        raise SourceError(f"{reader.path}: holds no tick")
     metadata = {"table": table, "flags": json.dumps(reader.flags), "session": json.dumps(reader.metadata)}
     count = 0
     try:

@@ -1,4 +1,4 @@
-"""A session in one MCAP file: every tick with the frames and orders it was given, and what it decided.
+"""A session as MCAP: every tick with the frames and orders it was given, and what it decided.
 
 Which frames a tick consumed is part of the log (``tick_ns`` in each), so a replay groups by tick, never by arrival.
 All messages of a tick lie in one chunk: damage takes whole ticks, and the reader says where.
@@ -10,21 +10,21 @@ import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple
 
 import pmutools
 from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surroundings
 from dcon.session import codec
-from dcon.session.codec import Timing, Watchdog
+from dcon.session.codec import Pdci, Timing, Watchdog
+from dcon.session.parts import SESSION, Part, Paths, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.log_writer import LogWriter
 from pmutools.schema.messages import MESSAGES
 from pmutools.schema.pmu_log import PmuFrame, PmuTopics, config_name, from_message, name_of
 
-SESSION = "session"
-"""Name of the metadata record that makes an MCAP file a session log."""
 INI_NAME = "dcon.ini"
 PROBE_NAME = "probing.csv"
 
@@ -118,6 +118,11 @@ class SessionWriter:
         if pdci is not None:
             self._write("Pdci", codec.encode_pdci(tick_ns, pdci), tick_ns, pdci.time_ns)
 
+    @property
+    def size(self) -> int:
+        """Bytes in the file; grows with every chunk that is flushed."""
+        return self._log.size
+
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """Attach a configuration frame that came at ``time_ns``."""
         self._pmus.config(name, frame, time_ns)
@@ -174,6 +179,8 @@ class TickMessages:
     frames: list[tuple[str, Any]] = field(default_factory=list)
     messages: dict[str, list[Any]] = field(default_factory=dict)
     configs: list[tuple[str, bytes]] = field(default_factory=list)
+    data: dict[str, list[bytes]] = field(default_factory=dict)
+    """All of them as they are in the file, in the same order."""
 
     def one(self, message: str) -> Any | None:
         """The tick's only message of that name; None where it has none."""
@@ -183,20 +190,20 @@ class TickMessages:
 class SessionReader:
     """A session log. What precedes the first tick is read at once.
 
-    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``probe_file`` (None where
-    there is none), ``configs`` (first frame of each PMU). ``damage`` and ``incomplete_ticks`` are those of the last
-    iteration, once it is exhausted.
-    Raises SourceError for a file that cannot be read or is no session log.
+    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``configs`` (first frame of
+    each PMU): those of the first part. ``incomplete_ticks`` and ``damage`` are those of the last iteration, once it is
+    exhausted. Which parts are read for ``paths``: :func:`~dcon.session.parts.parts_of`.
+    Raises SourceError for a file that cannot be read, is no session log, or not of the same session.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._log = LogReader(path)
+    def __init__(self, paths: Paths) -> None:
+        self.parts = parts_of(paths)
         self.metadata: dict[str, str] = {}
         self.attachments: dict[str, bytes] = {}
         self.incomplete_ticks = 0
         first_tick = self._read_head()
         if first_tick is None and not self.metadata:
-            raise SourceError(f"{path}: not a session log (no {SESSION!r} metadata, no tick)")
+            raise SourceError(f"{self.path}: not a session log (no {SESSION!r} metadata, no tick)")
         # chunks have a CRC, metadata records have none: the tick channel's word goes first
         names = self.metadata if first_tick is None else {**self.metadata, **first_tick.channel.metadata}
         self.pmus = _names(names, "pmus")
@@ -207,16 +214,22 @@ class SessionReader:
         self.configs = {name: data for key, data in self.attachments.items() if (name := config_name(key)) is not None}
 
     @property
+    def path(self) -> Path:
+        """Of the first part."""
+        return self.parts[0].log.path
+
+    @property
     def damage(self) -> Damage:
-        return self._log.damage
+        """Of all parts together."""
+        return sum((part.log.damage for part in self.parts), start=Damage())
 
     def ticks(self) -> Iterator[LoggedTick]:
         """Every whole tick with its inputs, in file order."""
         loss = False
-        for group in self.groups(_TICK_MESSAGES):
+        for group in self.groups(TICK_MESSAGES):
             loss |= group.after_loss
             try:
-                tick = _logged_tick(group, loss)
+                tick = logged_tick(group, loss)
             except ValueError:
                 self.incomplete_ticks += 1
                 loss = True
@@ -227,32 +240,52 @@ class SessionReader:
     def groups(self, messages: Collection[str]) -> Iterator[TickMessages]:
         """The wanted messages (names of the table) of each tick, decoded; memory is bounded by a tick and a chunk."""
         self.incomplete_ticks = 0
+        for part in self.parts:
+            part.log.damage = Damage()
+        before: Part | None = None
+        loss = False
+        for part in self.parts:
+            loss |= before is not None and self._is_apart(before, part)
+            for group in self._groups(part.log, messages):
+                group.after_loss |= loss
+                loss = False
+                yield group
+            before = part
+
+    @staticmethod
+    def _is_apart(before: Part, part: Part) -> bool:
+        """Whether anything is missing between two parts."""
+        return bool(before.log.damage or part.unlogged or part.number != before.number + 1)
+
+    def _groups(self, log: LogReader, messages: Collection[str]) -> Iterator[TickMessages]:
         group: TickMessages | None = None
         losses = 0
         configs: list[tuple[str, bytes]] = []
-        for entry in self._log.records(messages):
+        for entry in log.records(messages):
             if isinstance(entry, LogAttachment) and (name := config_name(entry.name)) is not None:
                 configs.append((name, entry.data))
-            if not isinstance(entry, LogMessage) or (message := self._log.decode(entry)) is None:
+            if not isinstance(entry, LogMessage) or (message := log.decode(entry)) is None:
                 continue
             if entry.channel.message == "PmuFrame" and not message.tick_ns:
                 continue  # no tick consumed it
             if group is None or message.tick_ns != group.tick_ns:
                 if group is not None:
                     yield group
-                group = TickMessages(message.tick_ns, after_loss=self.damage.losses > losses, configs=configs)
+                group = TickMessages(message.tick_ns, after_loss=log.damage.losses > losses, configs=configs)
                 configs = []
-                losses = self.damage.losses
-            if entry.channel.message == "PmuFrame":
+                losses = log.damage.losses
+            kind = str(entry.channel.message)
+            if kind == "PmuFrame":
                 group.frames.append((name_of(entry.channel.topic), message))
             else:
-                group.messages.setdefault(str(entry.channel.message), []).append(message)
+                group.messages.setdefault(kind, []).append(message)
+            group.data.setdefault(kind, []).append(entry.data)
         if group is not None:
             yield group
 
     def _read_head(self) -> LogMessage | None:
         """Take in what comes before the first tick, and return that."""
-        for entry in self._log.records({"Tick"}):
+        for entry in self.parts[0].log.records({"Tick"}):
             if isinstance(entry, LogMessage):
                 return entry
             if isinstance(entry, LogAttachment):
@@ -262,9 +295,8 @@ class SessionReader:
         return None
 
 
-_TICK_MESSAGES = frozenset(
-    ("PmuFrame", "Setting", "Surroundings", "Tick", "Instance", "Event", "Flag", "Timing", "Pdci")
-)
+TICK_MESSAGES = frozenset(("PmuFrame", "Setting", "Tick", "Instance", "Event", "Timing", "Pdci"))
+"""What a :class:`LoggedTick` is made of."""
 
 
 def _names(metadata: Mapping[str, str], key: str) -> tuple[str, ...]:
@@ -274,7 +306,7 @@ def _names(metadata: Mapping[str, str], key: str) -> tuple[str, ...]:
         return ()
 
 
-def _logged_tick(group: TickMessages, after_loss: bool) -> LoggedTick:
+def logged_tick(group: TickMessages, after_loss: bool = False) -> LoggedTick:
     """Raises ValueError where the tick is not whole."""
     tick, instance = group.one("Tick"), group.one("Instance")
     if tick is None or instance is None:

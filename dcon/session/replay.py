@@ -4,25 +4,34 @@ With the session's own settings every record must come out the same, to the last
 CHK and decode to what the log says; the first difference is reported with the tick's inputs. With changed settings
 the result is what the controller would have *commanded*: the grid that answered is the recorded one, so nothing is
 said of what the grid would have done.
+
+What is compared first are the bytes of the messages: they are the same where every value is, and nothing needs to be
+decoded for that. Events of the log itself are not the controller's, and are passed over.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from dcon.core.values import Record
-from dcon.engine import Engine
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.core.values import Order, Record
+from dcon.engine import Engine, Tick
+from dcon.session import codec
+from dcon.session.log import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
+from dcon.session.parts import Paths
+from dcon.session.rolling import LOG_SUBJECT
 from dcon.settings import parse
 from pmutools.c37118 import Frame, decode_config
 from pmutools.c37118.checksum import chk
 from pmutools.errors import SourceError, WireError
-from pmutools.schema.pmu_log import PmuFrame
+from pmutools.flow import StampSource
+from pmutools.schema.pmu_log import PmuFrame, encode_frame
 
-Observer = Callable[[LoggedTick, Record], None]
+Observer = Callable[[float, Record], None]
+"""(command_mw as recorded, the record of the tick now)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +42,50 @@ class Difference:
     field: str
     recorded: Any
     replayed: Any
-    frames: tuple[str, ...]
-    """The tick's inputs: PMU, stamp and arrival of each frame, and the orders."""
+    before: str
+    """How the tick before ended."""
+    frames: tuple[PmuFrame, ...]
+    orders: tuple[Order, ...]
 
     def __str__(self) -> str:
-        inputs = "; ".join(self.frames) or "no frames"
-        return f"tick {self.tick_ns}: {self.field} {self.recorded!r} -> {self.replayed!r} (inputs: {inputs})"
+        inputs = [f"before: {self.before}"]
+        inputs += [
+            f"{frame.name}: stamp {frame.time_ns}, arrival {frame.arrival_ns}, V1 {abs(frame.v1):.3f} V at "
+            f"{math.degrees(cmath.phase(frame.v1)):.4f}°, {frame.frequency_hz:.6f} Hz, STAT {frame.stat:#06x}"
+            for frame in self.frames
+        ]
+        inputs += [f"order: {order.name} {order.value:g}" for order in self.orders]
+        what = f"tick {self.tick_ns}: {self.field} {self.recorded!r} -> {self.replayed!r}"
+        return "\n  ".join((what, *(inputs if self.frames or self.orders else [*inputs, "no frames"])))
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "tick_ns": self.tick_ns,
+            "field": self.field,
+            "recorded": _plain(self.recorded),
+            "replayed": _plain(self.replayed),
+            "before": self.before,
+            "frames": [
+                {
+                    "pmu": frame.name,
+                    "time_ns": frame.time_ns,
+                    "arrival_ns": frame.arrival_ns,
+                    "v1_re": _plain(frame.v1.real),
+                    "v1_im": _plain(frame.v1.imag),
+                    "frequency_hz": _plain(frame.frequency_hz),
+                    "stat": frame.stat,
+                }
+                for frame in self.frames
+            ],
+            "orders": [{"name": order.name, "value": _plain(order.value)} for order in self.orders],
+        }
+
+
+def _plain(value: object) -> object:
+    """A value that JSON has; NaN, infinities and tuples as text."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    return value if isinstance(value, int | float | str | None) else repr(value)
 
 
 @dataclass
@@ -59,7 +106,7 @@ class Replay:
         return {
             "ticks": self.ticks,
             "different": self.different,
-            "first": str(self.first) if self.first else None,
+            "first": self.first.to_json() if self.first else None,
             "changes": list(self.changes),
             "stopped": self.stopped or None,
             "problems": self.problems,
@@ -67,55 +114,97 @@ class Replay:
         }
 
 
-def replay(path: str, changes: Sequence[str] = (), observe: Observer | None = None) -> Replay:
-    """Replay the session log at ``path``, with ``SECTION.KEY=VALUE`` changes laid over its settings.
+def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None = None) -> Replay:
+    """Replay a session log, with ``SECTION.KEY=VALUE`` changes laid over its settings.
 
-    ``observe`` is shown every tick as recorded, with the record it gives now. Raises SourceError for a file that is no
-    session log, SettingsError for settings that cannot be.
+    ``observe`` is shown every tick. Raises SourceError for what is no session log or not its beginning, SettingsError
+    for settings that cannot be.
     """
-    reader = SessionReader(path)
+    reader = SessionReader(paths)
+    if reader.parts[0].number > 1:
+        first = reader.metadata.get("first", "")
+        raise SourceError(
+            f"{reader.path}: part {reader.parts[0].number} of a session; a replay starts with the first"
+            f"{first and f', {first}'}"
+        )
     if not reader.ini_text:
-        raise SourceError(f"{path}: the log holds no initialisation file (its beginning is lost), so no replay")
-    settings = parse(reader.ini_text, f"{path}: {_INI}", tuple(changes), probe_file=reader.probe_file)
+        raise SourceError(f"{reader.path}: the log holds no initialisation file (its beginning is lost), so no replay")
+    settings = parse(reader.ini_text, f"{reader.path}: {_INI}", tuple(changes))
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
     result = Replay(changes=tuple(changes))
-    for tick in reader.ticks():
-        if tick.after_loss:
-            result.stopped = f"the log lost something before tick {tick.record.tick_ns}"
+    before = "the session begins"
+    for group in reader.groups(TICK_MESSAGES):
+        logged = group.one("Tick")
+        if group.after_loss:
+            result.stopped = f"the log lost something before tick {group.tick_ns}"
             break
-        _configure(engine, tick, result)
-        frames: dict[str, list[Frame]] = {}
-        for frame in tick.frames:
-            arrived = Frame(frame.wire, frame.arrival_ns, frame.stamp_source, 0)
-            frames.setdefault(frame.name, []).append(arrived)
-        now = engine.tick(frames, tick.orders, tick.record.tick_ns, tick.surroundings)
+        if logged is None or group.one("Instance") is None:
+            result.stopped = f"tick {group.tick_ns} is not whole"
+            break
+        now = _again(engine, group, result)
         result.ticks += 1
-        result.largest_mw = max(result.largest_mw, abs(now.record.command_mw - tick.record.command_mw))
-        found = (None if changes else _changed_frame(tick, now.frames)) or _changed_record(tick.record, now.record)
-        if found is not None:
-            result.different += 1
-            result.first = result.first or _difference(tick, *found)
+        result.largest_mw = max(result.largest_mw, abs(now.record.command_mw - logged.command_mw))
+        if not _same_bytes(group, now, reader.instances, frames=not changes):
+            try:
+                tick = logged_tick(group)
+            except ValueError as error:
+                result.stopped = str(error)
+                break
+            found = (None if changes else _changed_frame(tick, now.frames)) or _changed_record(tick.record, now.record)
+            if found is not None:
+                result.different += 1
+                result.first = result.first or Difference(group.tick_ns, *found, before, tick.frames, tick.orders)
         if observe is not None:
-            observe(tick, now.record)
-    if not result.stopped and (reader.damage or reader.incomplete_ticks):
-        result.stopped = "; ".join(reader.damage.lines()) or "the last tick is not whole"
+            observe(logged.command_mw, now.record)
+        before = (
+            f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
+            f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"
+        )
+    if not result.stopped and reader.damage:
+        result.stopped = "; ".join(reader.damage.lines())
     if not result.ticks and not result.stopped:
-        raise SourceError(f"{path}: holds no tick")
+        raise SourceError(f"{reader.path}: holds no tick")
     return result
 
 
 _INI = "initialisation file"
+_STAMP_SOURCES = {str(source): source for source in StampSource}
 
 
-def _configure(engine: Engine, tick: LoggedTick, result: Replay) -> None:
-    for name, frame in tick.configs:
+def _again(engine: Engine, group: TickMessages, result: Replay) -> Tick:
+    """The tick, from what the log says it was given."""
+    for name, config_frame in group.configs:
         try:
-            config = decode_config(frame)[1]
+            config = decode_config(config_frame)[1]
         except WireError as error:
             result.problems.append(f"{name}: {error}")
             continue
         if (problem := engine.reconfigure(name, config)) is not None:
             result.problems.append(problem)
+    frames: dict[str, list[Frame]] = {}
+    for name, message in group.frames:
+        source = _STAMP_SOURCES.get(message.stamp_source, StampSource.CAPTURE)
+        frames.setdefault(name, []).append(Frame(message.wire, message.arrival_ns or None, source, 0))
+    orders = tuple(Order(order.name, order.value) for order in group.messages.get("Setting", ()))
+    return engine.tick(frames, orders, group.tick_ns)
+
+
+def _same_bytes(group: TickMessages, now: Tick, instances: Sequence[str], *, frames: bool) -> bool:
+    """Whether the tick's messages come out the same byte for byte, and, with ``frames``, every frame holds its CHK."""
+    record, data = now.record, group.data
+    if codec.encode_tick(record, instances) != data["Tick"][0] or codec.encode_instances(record) != data["Instance"][0]:
+        return False
+    logged = [
+        wire
+        for event, wire in zip(group.messages.get("Event", ()), data.get("Event", ()), strict=True)
+        if event.subject != LOG_SUBJECT
+    ]
+    if [codec.encode_event(record.tick_ns, event) for event in record.events] != logged:
+        return False
+    if not frames:
+        return True
+    found = [encode_frame(frame, record.tick_ns) for frame in now.frames]
+    return found == data.get("PmuFrame", []) and not any(chk(message.wire) for _, message in group.frames)
 
 
 def identical(one: object, other: object) -> bool:
@@ -131,14 +220,11 @@ def identical(one: object, other: object) -> bool:
     return one == other
 
 
-def _difference(tick: LoggedTick, name: str, recorded: object, replayed: object) -> Difference:
-    inputs = [f"{frame.name} stamp {frame.time_ns} arrival {frame.arrival_ns}" for frame in tick.frames]
-    inputs += [f"order {order.name} {order.value:g}" for order in tick.orders]
-    return Difference(tick.record.tick_ns, name, recorded, replayed, tuple(inputs))
-
-
 def _changed_record(recorded: object, replayed: object, name: str = "") -> tuple[str, object, object] | None:
     """The first value that differs, with its place: ``instances.3.command_mw``."""
+    if isinstance(recorded, Record):
+        events = tuple(event for event in recorded.events if event.subject != LOG_SUBJECT)
+        recorded = recorded._replace(events=events)
     if identical(recorded, replayed):
         return None
     if isinstance(recorded, tuple) and isinstance(replayed, tuple) and len(recorded) == len(replayed):

@@ -7,8 +7,8 @@ Only clocks and sockets are missing. A run is a function of its plan.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from dcon.core.rows import CORE
 from dcon.core.values import Event, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
+from dcon.session.codec import Pdci
 from dcon.session.log import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
@@ -30,6 +31,7 @@ from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.grid import Grid
 from pmutools.grid.plant import build
 from pmutools.grid.pmu_model import PmuModel, fleet, measure
+from pmutools.grid.signals import Bus
 from pmutools.impair.outgoing import Fate
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Profile, parse_profile
@@ -56,8 +58,13 @@ class Outcome:
     command_mw: list[float] = field(default_factory=list)
     events: list[tuple[float, Event]] = field(default_factory=list)
     final_state: str = ""
+    peak_command_mw: float = 0.0
     mode: Estimate | None = None
     open_loop: Estimate | None = None
+
+    def summary(self) -> Outcome:
+        """The same without its columns."""
+        return replace(self, swing_mhz=[], tick_s=[], delta_f_mhz=[], command_mw=[])
 
     def to_json(self) -> dict[str, Any]:
         plan = self.plan
@@ -70,7 +77,7 @@ class Outcome:
             "duration_s": plan.length_s,
             "mode": None if self.mode is None else self.mode._asdict(),
             "open_loop": None if self.open_loop is None else self.open_loop._asdict(),
-            "peak_command_mw": max(map(abs, self.command_mw), default=0.0),
+            "peak_command_mw": self.peak_command_mw,
             "final_state": self.final_state,
             "events": [
                 {"time_s": round(time_s, 6), "name": event.name, "subject": event.subject, "detail": event.detail}
@@ -104,6 +111,8 @@ def settings_of(plan: Plan, pmus: Sequence[PmuModel]) -> Settings:
 
 Tell = Callable[[float], None]
 TOLD_TICKS = 600
+SCHEDULE_MW = 2000.0
+"""Of the DC line, north to south; assumed, and without effect on the plants that there are."""
 
 
 def simulate(plan: Plan, log_path: str | None = None, tell: Tell | None = None) -> Outcome:
@@ -146,6 +155,7 @@ def simulate(plan: Plan, log_path: str | None = None, tell: Tell | None = None) 
             flags=CORE.names,
         ) as log:
             _run(plan, delays, senders, engine, outcome, log, tell)
+    outcome.peak_command_mw = max(map(abs, outcome.command_mw), default=0.0)
     if plan.course.ringdown_s is not None:
         if plan.control:
             outcome.mode = judge(outcome.swing_mhz, plan)
@@ -188,7 +198,12 @@ def _run(
         if tell is not None and number % TOLD_TICKS == 0:
             tell(outcome.tick_s[-1])
         if log is not None:
-            log.tick(tick.record, tick.frames, orders, surroundings=tick.surroundings)
+            log.tick(tick.record, tick.frames, orders, pdci=_line(grid, tick_ns))
+
+
+def _line(grid: Grid, tick_ns: int) -> Pdci:
+    """The DC line as it is at a tick: at most 1/60 s after the grid was last looked at."""
+    return Pdci(tick_ns, SCHEDULE_MW + grid.drive.modulation_mw)
 
 
 def _grid(plan: Plan, command_ns: int) -> Grid:
@@ -209,7 +224,7 @@ def _measure(
     """Move the grid to a reporting instant and send every PMU's frame: (arrival, PMU, bytes) of what gets through."""
     grid.advance(stamp_ns)
     buses = grid.buses()
-    outcome.swing_mhz.append((buses["north"].deviation_hz - buses["south"].deviation_hz) * 1e3)
+    outcome.swing_mhz.append(_swing_mhz(buses))
     for sender in senders:
         report = measure(sender.pmu, buses, stamp_ns, slot, nominal_hz=sender.stream.nominal_hz)
         data = sender.stream.data_frame([report])
@@ -234,9 +249,13 @@ def _uncontrolled(plan: Plan) -> list[float]:
     stamps = _stamps(plan)
     for _ in range(round(plan.length_s * plan.rate_hz)):
         grid.advance(next(stamps))
-        buses = grid.buses()
-        swing.append((buses["north"].deviation_hz - buses["south"].deviation_hz) * 1e3)
+        swing.append(_swing_mhz(grid.buses()))
     return swing
+
+
+def _swing_mhz(buses: Mapping[str, Bus]) -> float:
+    north, south = buses["north"], buses["south"]
+    return (north.deviation_hz - south.deviation_hz + north.common_hz - south.common_hz) * 1e3
 
 
 def judge(swing_mhz: Sequence[float], plan: Plan) -> Estimate | None:

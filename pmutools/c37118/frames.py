@@ -25,7 +25,7 @@ from pmutools.c37118.constants import (
     FrameType,
     command_name,
 )
-from pmutools.c37118.layout import Layout, layout_of
+from pmutools.c37118.layout import Layout, StationSlots, layout_of
 from pmutools.c37118.prefix import Prefix, decode_prefix, encode_prefix, verified
 from pmutools.errors import EncodeError, LengthError, WireError
 
@@ -128,10 +128,7 @@ class Data:
 
     def station(self, station: int = 0) -> StationData:
         values, slots = self.values, self.layout.slots[station]
-        if slots.parts is not None:
-            phasors = tuple(map(complex, values[slots.parts[0]], values[slots.parts[1]]))
-        else:
-            phasors = tuple(map(self.phasor, slots.phasor_columns))
+        phasors = self._phasors(slots)
         stat, frequency = values[slots.stat], self.frequency(station)
         present = not math.isnan(frequency) or not all(map(cmath.isnan, phasors))
         return StationData(
@@ -143,6 +140,20 @@ class Data:
             tuple(map(self.analog, slots.analog_columns)) if slots.analog_columns else (),
             values[slots.digitals.start : slots.digitals.stop],  # type: ignore[arg-type]
         )
+
+    def _phasors(self, slots: StationSlots) -> tuple[complex, ...]:
+        """All phasors of a station, at once where they stand in the frame as they are."""
+        if slots.parts is not None:
+            first, second = self.values[slots.parts[0]], self.values[slots.parts[1]]
+            if not slots.polar:
+                return tuple(map(complex, first, second))
+            try:
+                phasors = tuple(map(cmath.rect, first, second))
+            except ValueError:  # an infinite angle
+                phasors = (_NAN_PHASOR,)
+            if all(map(cmath.isfinite, phasors)):
+                return phasors
+        return tuple(map(self.phasor, slots.phasor_columns))
 
     @property
     def stations(self) -> tuple[StationData, ...]:

@@ -66,7 +66,10 @@ class StationSlots(NamedTuple):
     fnom_hz: float
     digitals: range
     parts: tuple[slice, slice] | None
-    """Real and imaginary parts, where these are the phasors as they stand: floats without factor and turn."""
+    """Real and imaginary parts, or magnitudes and angles, where these are the phasors as they stand: floats without
+    factor and turn."""
+    polar: bool
+    """Which of the two ``parts`` are."""
     phasor_columns: range
     analog_columns: range
     digital_columns: range
@@ -170,6 +173,7 @@ def layout_of(config: StreamConfig) -> Layout:
                 station.fnom_hz,
                 range(first_digital, first_digital + words),
                 _parts(phasors[first_phasor:]),
+                bool(station.format & Format.POLAR),
                 range(first_phasor, len(phasors)),
                 range(first_analog, len(analogs)),
                 range(digital_column, digital_column + words),
@@ -193,11 +197,11 @@ def layout_of(config: StreamConfig) -> Layout:
     return _known.setdefault((layout.stations, layout.phasors, layout.analogs, layout.time_base, nominal), layout)
 
 
-_PLAIN = PhasorSlot(0, polar=False, floating=True, factor=1.0, angle_offset_rad=0.0)[1:]
+_PLAIN = PhasorSlot(0, polar=False, floating=True, factor=1.0, angle_offset_rad=0.0)[2:]
 
 
 def _parts(phasors: Sequence[PhasorSlot]) -> tuple[slice, slice] | None:
-    if not phasors or any(slot[1:] != _PLAIN for slot in phasors):
+    if not phasors or any(slot[2:] != _PLAIN for slot in phasors):
         return None
     first, last = phasors[0].first, phasors[-1].first
     return slice(first, last + 1, 2), slice(first + 1, last + 2, 2)

@@ -68,6 +68,10 @@ SEPARATED_FROM_BC: Final = (Mode("North-South B", 0.37, 0.0, 18.99e-6, 6.34e-6, 
 gives its 4.1 % at 12 MW/mHz."""
 
 
+SEPARATED_FROM_ALBERTA: Final = (Mode("North-South", 0.32, 0.08, 18.99e-6, 6.34e-6, 1.0),)
+"""Alberta islanded: its mode and North-South A and B become one. Frequency, damping and residues are assumed."""
+
+
 class _Motion(NamedTuple):
     x1: float = 0.0
     x2: float = 0.0
@@ -96,7 +100,7 @@ class ModalPlant:
         return Bus(angle, deviation, rocof)
 
     def buses(self, drive: Drive) -> dict[str, Bus]:
-        angle, deviation, rocof, _ = self.difference(drive)
+        angle, deviation, rocof, *_ = self.difference(drive)
         north = Bus(angle / 2, deviation / 2, rocof / 2)
         return {"north": north, "south": Bus(-north.angle_rad, -north.deviation_hz, -north.rocof_hz_s)}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple, Protocol
 
 from pmutools.errors import SettingsError
-from pmutools.grid.modal import FIVE_MODES, SEPARATED_FROM_BC, SINGLE_MODE, ModalPlant
+from pmutools.grid.modal import FIVE_MODES, SEPARATED_FROM_ALBERTA, SEPARATED_FROM_BC, SINGLE_MODE, ModalPlant
 from pmutools.grid.signals import Bus, Drive
 
 
@@ -28,12 +28,19 @@ class PlantKind(NamedTuple):
     text: str
 
 
-def _modal(condition: str) -> Plant:
-    return ModalPlant({"normal": SINGLE_MODE, "bc-us-separated": SEPARATED_FROM_BC}[condition])
-
+MODAL: Final = {
+    "normal": SINGLE_MODE,
+    "bc-us-separated": SEPARATED_FROM_BC,
+    "bc-alberta-separated": SEPARATED_FROM_ALBERTA,
+}
+"""Modes of the plant ``modal`` by condition."""
 
 PLANTS: Final = {
-    "modal": PlantKind(_modal, ("normal", "bc-us-separated"), "North-South B mode alone, fitted to Table II; linear"),
+    "modal": PlantKind(
+        lambda condition: ModalPlant(MODAL[condition]),
+        tuple(MODAL),
+        "North-South B mode alone, fitted to Table II; linear",
+    ),
     "modal-five": PlantKind(lambda _: ModalPlant(FIVE_MODES), ("normal",), "five modes, one of them the HVDC line's"),
 }
 

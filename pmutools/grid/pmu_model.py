@@ -63,7 +63,7 @@ def measure(
 ) -> Measurement:
     """Report of ``buses`` at ``time_ns``, which is reporting instant ``slot``: all that the noise depends on."""
     bus = buses[pmu.bus]
-    angle = pmu.angle_rad + pmu.swing * bus.angle_rad
+    angle = pmu.angle_rad + pmu.swing * bus.angle_rad + bus.common_rad
     magnitude = bus.voltage_pu * pmu.nominal_kv * 1e3 / math.sqrt(3)
     if pmu.noise_rad:
         angle += pmu.noise_rad * normal(pmu.seed, str(pmu.idcode), "angle", slot)
@@ -78,20 +78,20 @@ def measure(
         vc=vc,
         v1=v1,
         i1=cmath.rect(pmu.current_a, angle - 0.2),
-        frequency_hz=nominal_hz + pmu.swing * bus.deviation_hz,
-        rocof_hz_s=pmu.swing * bus.rocof_hz_s,
+        frequency_hz=nominal_hz + pmu.swing * bus.deviation_hz + bus.common_hz,
+        rocof_hz_s=pmu.swing * bus.rocof_hz_s + bus.common_hz_s,
     )
 
 
 def measured_columns(
     pmu: PmuModel, course: npt.NDArray[np.float64], slots: range, *, nominal_hz: float = 60.0
 ) -> tuple[npt.NDArray[Any], ...]:
-    """:func:`measure` over N reporting instants ``slots``, at which the bus shows ``course`` (N, 4): a column a value.
+    """:func:`measure` over N reporting instants ``slots``, at which the bus shows ``course`` (N, 7): a column a value.
 
     The columns are those of :class:`Measurement` from ``va`` on, each (N,), but for the last bit of a float.
     """
-    turned, deviation_hz, rocof_hz_s, voltage_pu = course.T
-    angle = pmu.angle_rad + pmu.swing * turned
+    turned, deviation_hz, rocof_hz_s, voltage_pu, common_rad, common_hz, common_hz_s = course.T
+    angle = pmu.angle_rad + pmu.swing * turned + common_rad
     magnitude = voltage_pu * pmu.nominal_kv * 1e3 / math.sqrt(3)
     if pmu.noise_rad:
         angle = angle + pmu.noise_rad * _draws(pmu, "angle", slots)
@@ -100,7 +100,8 @@ def measured_columns(
     v1 = magnitude * np.exp(1j * angle)
     i1 = pmu.current_a * np.exp(1j * (angle - 0.2))
     phases = (v1 * turn for turn in _ROTATE)
-    return (*phases, v1, i1, nominal_hz + pmu.swing * deviation_hz, pmu.swing * rocof_hz_s)
+    frequency_hz = nominal_hz + pmu.swing * deviation_hz + common_hz
+    return (*phases, v1, i1, frequency_hz, pmu.swing * rocof_hz_s + common_hz_s)
 
 
 def _draws(pmu: PmuModel, stage: str, slots: range) -> npt.NDArray[np.float64]:

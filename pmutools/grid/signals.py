@@ -14,10 +14,24 @@ class Drive(NamedTuple):
     """Load of the dynamic brake in the north."""
 
 
+class Common(NamedTuple):
+    """Angle, deviation and rate that every place shares: the interconnection's own frequency."""
+
+    angle_rad: float = 0.0
+    deviation_hz: float = 0.0
+    rocof_hz_s: float = 0.0
+
+
 class Bus(NamedTuple):
-    """Voltage at one bus: angle in the frame of nominal frequency (it turns, and is not wrapped), deviation, rate."""
+    """Voltage at one bus: angle in the frame of nominal frequency (it turns, and is not wrapped), deviation, rate.
+
+    These swing against other buses. What all share is beside them: a place that swings less with its bus has it whole.
+    """
 
     angle_rad: float
     deviation_hz: float
     rocof_hz_s: float
     voltage_pu: float = 1.0
+    common_rad: float = 0.0
+    common_hz: float = 0.0
+    common_hz_s: float = 0.0

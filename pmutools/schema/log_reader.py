@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -73,6 +73,10 @@ class Damage:
 
     def __bool__(self) -> bool:
         return bool(self.cut or self.losses)
+
+    def __add__(self, other: Damage) -> Damage:
+        counts = {item.name: getattr(self, item.name) + getattr(other, item.name) for item in fields(self)}
+        return Damage(**counts | {"cut": self.cut or other.cut})
 
     @property
     def losses(self) -> int:

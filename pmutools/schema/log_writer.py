@@ -6,11 +6,13 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping
 from types import TracebackType
-from typing import IO, Any
+from typing import IO
 
 import pmutools
 from pmutools.errors import SourceError
 from pmutools.schema.descriptors import file_descriptor_set, full_name
+from pmutools.schema.mcap_parts import OpenChunk, Summary, serialised
+from pmutools.schema.mcap_records import MAGIC
 from pmutools.timebase import NS
 
 CHUNK_NS = NS
@@ -23,31 +25,38 @@ class LogWriter:
     """Writes one MCAP file (zstd chunks with CRC, embedded schemas, index at the end); a context manager.
 
     ``target`` is a path, or a seekable binary stream, which stays open. Every method raises SourceError, one line,
-    where the system refuses to write; the log then takes nothing more, and what was flushed stays readable.
+    where the system refuses to write; the log then ends with its last whole record, takes nothing more, and what was
+    flushed stays readable.
     """
 
     def __init__(self, target: str | os.PathLike[str] | IO[bytes]) -> None:
-        from mcap.writer import CompressionType, Writer
+        from mcap.records import Header
 
         self._closed = False
         self._failure: SourceError | None = None
         self._chunk_start_ns: int | None = None
-        self._schemas: dict[str, int] = {}
+        self._chunk = OpenChunk()
+        self._summary = Summary()
         self._owned = isinstance(target, (str, os.PathLike))
         self.name = str(target) if self._owned else str(getattr(target, "name", "log"))
+        self.size = 0
+        """Bytes written so far; the open chunk is not among them."""
         self._stream: IO[bytes] | None = None
         with self._writing():
-            self._stream = open(target, "wb") if isinstance(target, (str, os.PathLike)) else target  # noqa: SIM115
-            self._mcap: Any = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-            self._mcap.start(library=f"pmutools {pmutools.__version__}")
+            # unbuffered: what a full disk refuses is refused here and now
+            self._stream = (
+                open(target, "wb", buffering=0) if isinstance(target, (str, os.PathLike)) else target  # noqa: SIM115
+            )
+            self._put(MAGIC + serialised(Header("", f"pmutools {pmutools.__version__}")))
 
     def channel(self, topic: str, message: str, metadata: Mapping[str, str] | None = None) -> int:
         """Announce a topic that carries ``message`` (a name of the table); returns the number that `write` takes."""
-        with self._writing():
-            if message not in self._schemas:
-                schema = self._mcap.register_schema(full_name(message), "protobuf", file_descriptor_set())
-                self._schemas[message] = schema
-            return int(self._mcap.register_channel(topic, "protobuf", self._schemas[message], dict(metadata or {})))
+        if self._failure is not None:
+            raise self._failure
+        schema, announced = self._summary.schema(full_name(message), file_descriptor_set())
+        number, described = self._summary.channel(topic, schema, dict(metadata or {}))
+        self._chunk.define(announced + described)
+        return number
 
     def write(self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add a serialised message to the open chunk. Times before 1970 become 0: MCAP has no others."""
@@ -55,10 +64,9 @@ class LogWriter:
             raise self._failure
         if self._chunk_start_ns is None:
             self._chunk_start_ns = log_time_ns
-        try:
-            self._mcap.add_message(channel, max(log_time_ns, 0), data, max(publish_time_ns, 0))
-        except OSError as error:
-            raise self._failed(error) from None
+        self._chunk.add(channel, max(log_time_ns, 0), max(publish_time_ns, 0), data)
+        if self._chunk.size > CHUNK_BYTES:
+            self._end_chunk()
 
     def checkpoint(self, now_ns: int) -> None:
         """Say that nothing written later belongs to what was written before; flushes once a second of log time."""
@@ -69,29 +77,32 @@ class LogWriter:
     def flush(self) -> None:
         """End the chunk and hand everything to the operating system: a process killed later loses none of it."""
         self._chunk_start_ns = None
-        with self._writing():
-            self._mcap.flush()
+        self._end_chunk()
+        with self._writing() as stream:
+            stream.flush()
 
     def attach(self, name: str, data: bytes, time_ns: int = 0, media_type: str = "application/octet-stream") -> None:
         """Attach a file; ``time_ns`` 0 where it has none. Ends the chunk: order in the file is order in time."""
         self.flush()
+        record = self._summary.attachment(self.size, name, media_type, max(time_ns, 0), data)
         with self._writing():
-            self._mcap.add_attachment(max(time_ns, 0), max(time_ns, 0), name, media_type, data)
+            self._put(record)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record."""
         self.flush()
+        record = self._summary.metadata(self.size, name, dict(values))
         with self._writing():
-            self._mcap.add_metadata(name, dict(values))
+            self._put(record)
 
     def close(self) -> None:
         """Write the index and close; does nothing the second time, or after a failure that was already raised."""
         if self._closed:
             return
-        with self._writing():
-            self._mcap.finish()
-            if self._stream is not None:
-                self._stream.flush()
+        self.flush()
+        with self._writing() as stream:
+            self._put(self._summary.end(self.size) + MAGIC)
+            stream.flush()
         self._release()
 
     def __enter__(self) -> LogWriter:
@@ -100,18 +111,41 @@ class LogWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
 
+    def _end_chunk(self) -> None:
+        if not self._chunk.messages:
+            return
+        chunk, self._chunk = self._chunk, OpenChunk()
+        record, index = self._summary.chunk(self.size, chunk)
+        with self._writing():
+            self._put(record)
+            self._put(index)
+
+    def _put(self, record: bytes) -> None:
+        """Write all of ``record``, or leave the file as it was."""
+        assert self._stream is not None
+        left = memoryview(record)
+        try:
+            while left:
+                left = left[self._stream.write(left) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._stream.seek(self.size)
+                self._stream.truncate()
+            raise
+        self.size += len(record)
+
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _writing(self) -> Iterator[IO[bytes]]:
         if self._failure is not None:
             raise self._failure
         try:
-            yield
+            yield self._stream  # type: ignore[misc]  # only before it is open is it None
         except OSError as error:
             raise self._failed(error) from None
 
     def _failed(self, error: OSError) -> SourceError:
         self._failure = SourceError(f"{self.name}: cannot write: {error.strerror or error}")
-        with contextlib.suppress(OSError):  # closing tries to write what is buffered, and fails as before
+        with contextlib.suppress(OSError):
             self._release()
         return self._failure
 

@@ -25,7 +25,7 @@ _WINDOW = 1 << 20
 
 
 class Op(IntEnum):
-    """Opcodes that a reader of messages cares about."""
+    """Opcodes of records that a log has."""
 
     FOOTER = 0x02
     SCHEMA = 0x03
@@ -33,9 +33,13 @@ class Op(IntEnum):
     MESSAGE = 0x05
     CHUNK = 0x06
     MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
     ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
     STATISTICS = 0x0B
     METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
     DATA_END = 0x0F
 
 

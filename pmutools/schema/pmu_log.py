@@ -62,7 +62,6 @@ class PmuTopics:
         self.log = log
         self._channels: dict[str, int] = {}
         self._described: dict[str, dict[str, str]] = {}
-        self._message = message_class("PmuFrame")
 
     def config(self, name: str, frame: bytes, time_ns: int = 0) -> None:
         """Attach a configuration frame of ``name``, which holds for the frames written after it."""
@@ -82,31 +81,35 @@ class PmuTopics:
             described = self._described.get(frame.name, {})
             channel = self.log.channel(topic_of(frame.name), "PmuFrame", described)
             self._channels[frame.name] = channel
-        arrival_ns = frame.arrival_ns or 0
-        message = self._message(
-            time_ns=frame.time_ns,
-            arrival_ns=arrival_ns,
-            tick_ns=tick_ns or frame.tick_ns,
-            stamp_source=frame.stamp_source,
-            wire=frame.wire,
-            time_base=frame.time_base,
-            stat=frame.stat,
-            time_quality=frame.time_quality,
-            v1_re=frame.v1.real,
-            v1_im=frame.v1.imag,
-            frequency_hz=frame.frequency_hz,
-            rocof_hz_s=frame.rocof_hz_s,
-            phasor_re=[phasor.real for phasor in frame.phasors],
-            phasor_im=[phasor.imag for phasor in frame.phasors],
-        )
-        if frame.analogs or frame.digitals:  # as keywords, empty lists too would cost 0.3 us each
-            message.analog.extend(frame.analogs)
-            message.digital.extend(frame.digitals)
-        if frame.station_stat:
-            message.station_stat.extend(frame.station_stat)
-            message.station_frequency_hz.extend(frame.station_frequency_hz)
-            message.station_rocof_hz_s.extend(frame.station_rocof_hz_s)
-        self.log.write(channel, message.SerializeToString(), arrival_ns or frame.time_ns, frame.time_ns)
+        self.log.write(channel, encode_frame(frame, tick_ns), frame.arrival_ns or frame.time_ns, frame.time_ns)
+
+
+def encode_frame(frame: PmuFrame, tick_ns: int = 0) -> bytes:
+    """The ``PmuFrame`` message; ``tick_ns`` overrides the frame's."""
+    message = message_class("PmuFrame")(
+        time_ns=frame.time_ns,
+        arrival_ns=frame.arrival_ns or 0,
+        tick_ns=tick_ns or frame.tick_ns,
+        stamp_source=frame.stamp_source,
+        wire=frame.wire,
+        time_base=frame.time_base,
+        stat=frame.stat,
+        time_quality=frame.time_quality,
+        v1_re=frame.v1.real,
+        v1_im=frame.v1.imag,
+        frequency_hz=frame.frequency_hz,
+        rocof_hz_s=frame.rocof_hz_s,
+        phasor_re=[phasor.real for phasor in frame.phasors],
+        phasor_im=[phasor.imag for phasor in frame.phasors],
+    )
+    if frame.analogs or frame.digitals:  # as keywords, empty lists too would cost 0.3 us each
+        message.analog.extend(frame.analogs)
+        message.digital.extend(frame.digitals)
+    if frame.station_stat:
+        message.station_stat.extend(frame.station_stat)
+        message.station_frequency_hz.extend(frame.station_frequency_hz)
+        message.station_rocof_hz_s.extend(frame.station_rocof_hz_s)
+    return bytes(message.SerializeToString())
 
 
 def topic_of(name: str) -> str:
@@ -119,9 +122,7 @@ def name_of(topic: str) -> str:
 
 def pmu_frame(name: str, frame: Frame, data: Data, *, station: int = 0, v1: complex = complex(_NAN, _NAN)) -> PmuFrame:
     """A received frame and what it decodes to; ``station`` is the PMU's own in a frame of several."""
-    stations = data.stations
-    several = stations if len(stations) > 1 else ()
-    own = stations[station]
+    own, several = data.station(station), data.stations if len(data.layout.slots) > 1 else ()
     return PmuFrame(
         name,
         bytes(frame.data),
@@ -144,7 +145,7 @@ def pmu_frame(name: str, frame: Frame, data: Data, *, station: int = 0, v1: comp
 
 
 def from_message(name: str, message: Any) -> PmuFrame:
-    """The inverse of :meth:`PmuTopics.write`, for a decoded protobuf message."""
+    """The inverse of :func:`encode_frame`, for a decoded protobuf message."""
     return PmuFrame(
         name,
         message.wire,

@@ -193,7 +193,7 @@ def plant_blocks(recipe: Recipe) -> Iterator[Block | Message]:
 
 
 def _courses(grid: Grid, times_ns: Sequence[int]) -> dict[str, npt.NDArray[np.float64]]:
-    """What each bus shows at these times: (N, 4), columns as in :class:`Bus`."""
+    """What each bus shows at these times: (N, 7), columns as in :class:`Bus`."""
     seen: dict[str, list[Bus]] = {}
     for time_ns in times_ns:
         grid.advance(time_ns)

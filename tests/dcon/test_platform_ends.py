@@ -1,4 +1,4 @@
-"""How a session in real time ends: by its time, on request, for want of a log, by an error; each time with 0 V."""
+"""How a session in real time ends: by its time, on request, by an error; each time with 0 V. A full disk is no end."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from support.disk import full_disk
 from support.virtual_platform import Bench, Item, stream, virtual_platform
 
-from dcon.core.values import Record, SystemState
+from dcon.core.values import SystemState
 from dcon.engine import Engine
 from dcon.limiter import SLEW_MW_PER_S
-from dcon.session.log import SessionWriter
+from dcon.session.replay import replay
 from pmutools.errors import SourceError
 
 Make = Callable[..., Bench]
@@ -64,25 +65,25 @@ def test_a_request_to_stop_while_nothing_is_driven_ends_at_once(bench: Make) -> 
     assert [volts for _, volts, _ in made.driver.sent] == [0.0]
 
 
-def test_a_log_that_cannot_be_written_ends_the_session_with_a_ramp(
-    bench: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_full_disk_does_not_stop_the_controller(
+    bench: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A full disk: nothing unrecorded is driven for longer than the ramp, and there is no step."""
-    made = bench(stream(6))
-    write = SessionWriter.tick
-
-    def full(self: SessionWriter, record: Record, *args: object, **given: object) -> None:
-        if made.clock.passed_s > 3.2:
-            raise SourceError("s.mcap: cannot write: No space left on device")
-        write(self, record, *args, **given)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(SessionWriter, "tick", full)
-    with pytest.raises(SourceError, match="No space left on device"):
-        made.run(20)
-    assert caplog.text.count("No space left") == 1
-    ramped(made, 3.22)
-    assert made.records[-1].state is SystemState.ACTIVE  # the last that was written
-    made.ended_well()
+    """Ticks that find no room are counted, every command goes out, and a new part follows when there is room again."""
+    disk = full_disk(tmp_path, monkeypatch)
+    made = bench(stream(30))
+    made.clock.at(5.2, lambda: setattr(disk, "capacity", 0))
+    made.clock.at(9.0, lambda: setattr(disk, "capacity", float("inf")))
+    summary = made.run(28)
+    assert [Path(name).name for name in summary.log_parts] == ["s.mcap", "s.part2.mcap"]
+    assert len(made.driver.sent) == summary.ticks + 1 == pytest.approx(28 * 60, abs=90)
+    assert 10 * 60 <= summary.unlogged_ticks <= 12 * 60
+    logged = [record.tick_ns for record in made.records]
+    assert len(logged) + summary.unlogged_ticks == summary.ticks
+    assert made.records[-1].events or made.records[-1].state is SystemState.STANDBY
+    assert caplog.text.count("control goes on") == 1 and caplog.text.count("logging again") == 1
+    assert max(made.steps_mw()) <= SLEW_MW_PER_S / 60 + 1e-9
+    result = replay(made.path)
+    assert result.different == 0 and result.stopped.startswith("the log lost something before tick")
 
 
 def test_a_log_that_cannot_be_opened(bench: Make, tmp_path: Path) -> None:

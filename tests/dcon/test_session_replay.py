@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from dcon.cli import dcon
-from dcon.core.values import Event
+from dcon.core.values import Event, Order, Record
+from dcon.session import codec
 from dcon.session.log import LoggedTick, SessionReader, SessionWriter
 from dcon.session.replay import identical, replay
 from dcon.sim.plan import Plan
@@ -78,9 +79,10 @@ def test_a_simulated_session_replays_bit_for_bit(session: Path, capsys: Capsys) 
 
 def test_the_records_are_those_of_the_log(session: Path) -> None:
     ticks = list(SessionReader(session).ticks())
-    seen: list[bool] = []
-    replay(str(session), observe=lambda tick, now: seen.append(identical(tick.record, now)))
-    assert seen == [True] * len(ticks)
+    seen: list[Record] = []
+    replay(session, observe=lambda recorded_mw, now: seen.append(now))
+    assert len(seen) == len(ticks)
+    assert all(identical(tick.record, now) for tick, now in zip(ticks, seen, strict=True))
     assert max(abs(tick.record.command_mw) for tick in ticks) > 30  # there was something to get wrong
     assert sum(len(tick.record.events) for tick in ticks) > 20
 
@@ -138,12 +140,53 @@ def test_a_changed_log_is_told_with_the_first_difference_and_its_inputs(
     path = rewritten(session, tmp_path / "tampered.mcap", edit)
     code, out, _ = told(capsys, str(path))
     assert code == 3
-    assert out.count("\n") == 1
     head, _, first = out.partition(" of 360 ticks differ; first: ")
     assert int(head) >= 1
-    tick = list(SessionReader(path).ticks())[EDITED]
-    assert first.startswith(f"tick {tick.record.tick_ns}: ") and said in first
-    assert all(f"{f.name} stamp {f.time_ns} arrival {f.arrival_ns}" in first for f in tick.frames)
+    ticks = list(SessionReader(path).ticks())
+    tick, before = ticks[EDITED], ticks[EDITED - 1].record
+    what, *inputs = first.splitlines()
+    assert what.startswith(f"tick {tick.record.tick_ns}: ") and said in what
+    assert inputs[0] == (f"  before: ACTIVE closed_loop, N1-S1 active, 12 MW/mHz, command {before.command_mw!r} MW")
+    assert len(inputs) == 1 + len(tick.frames)
+    for line, frame in zip(inputs[1:], tick.frames, strict=True):
+        assert line.startswith(
+            f"  {frame.name}: stamp {frame.time_ns}, arrival {frame.arrival_ns}, V1 {abs(frame.v1):.3f} V"
+        )
+        assert f"{frame.frequency_hz:.6f} Hz" in line
+    code, out, _ = told(capsys, str(path), "--json")
+    assert code == 3
+    first_json = json.loads(out)["first"]
+    assert first_json["tick_ns"] == tick.record.tick_ns and first_json["orders"] == []
+    assert [(f["pmu"], f["time_ns"], f["arrival_ns"]) for f in first_json["frames"]] == [
+        (f.name, f.time_ns, f.arrival_ns) for f in tick.frames
+    ]
+
+
+def test_orders_are_among_the_inputs(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    def edit(tick: LoggedTick) -> LoggedTick:
+        return tick._replace(orders=(Order("gain", 3.0), Order("estop")))
+
+    code, out, _ = told(capsys, str(rewritten(session, tmp_path / "x.mcap", edit)))
+    assert code == 3 and "state <SystemState.ACTIVE: 'ACTIVE'> -> <SystemState.ESTOP: 'ESTOP'>" in out
+    assert out.endswith("  order: gain 3\n  order: estop 0\n")
+
+
+def test_other_bytes_of_the_same_values_are_no_difference(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    """As another protobuf library may write them: here, with a field that this version does not know."""
+    path = tmp_path / "x.mcap"
+    encode = codec.encode_tick
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "encode_tick", lambda *given: encode(*given) + b"\x9a\x06\x03new")
+        rewritten(session, path)
+    assert told(capsys, str(path))[:2] == (0, "360 ticks: identical\n")
+
+
+def test_events_of_the_log_are_not_the_controllers(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    def edit(tick: LoggedTick) -> LoggedTick:
+        events = (*tick.record.events, Event("log_gap", "log", "3 ticks were not logged"))
+        return tick._replace(record=tick.record._replace(events=events))
+
+    assert told(capsys, str(rewritten(session, tmp_path / "x.mcap", edit)))[:2] == (0, "360 ticks: identical\n")
 
 
 def test_settings_can_be_changed(session: Path, tmp_path: Path, capsys: Capsys) -> None:

@@ -23,7 +23,8 @@ KEYS = (
 
 def told(capsys: Capsys, *arguments: str) -> list[dict[str, object]]:
     assert run(dcon(), ["simulate", *arguments, "--json"]) == 0
-    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    said = json.loads(capsys.readouterr().out)
+    return said if isinstance(said, list) else [said]
 
 
 @pytest.mark.parametrize(("gain", "hz", "percent"), [(0, 0.425, 7.8), (9, 0.433, 10.3), (12, 0.435, 11.4)])
@@ -98,13 +99,55 @@ def test_simulated_sessions_begin_initialised_and_rows_are_consecutive(capsys: C
     assert all(b - a == pytest.approx(1 / 60, abs=1e-6) for a, b in pairwise(outcome.tick_s))
 
 
-def test_sweeps_are_one_line_a_run(capsys: Capsys) -> None:
-    rows = told(capsys, "cjb", "--sweep", "gain=0:12:6", "--sweep", "delay=82:113:31", "--duration", "3")
-    assert [(row["gain_mw_per_mhz"], row["delay_ms"]) for row in rows] == [
-        *((0.0, 82.0), (0.0, 113.0), (6.0, 82.0), (6.0, 113.0), (12.0, 82.0), (12.0, 113.0))
+def test_a_sweep_is_every_combination_in_order(tmp_path: Path, capsys: Capsys) -> None:
+    sweeps = ("--sweep", "gain=0:12:6", "--sweep", "delay=82:113:31", "--sweep", "noise=0.1:0.1:1")
+    rows = told(capsys, "cjb", *sweeps, "--duration", "3", "--out", str(tmp_path / "runs"))
+    assert [row["swept"] for row in rows] == [
+        {"gain": gain, "delay": delay, "noise": 0.1} for gain in (0.0, 6.0, 12.0) for delay in (82.0, 113.0)
     ]
-    assert run(dcon(), ["simulate", "cjb", "--sweep", "seed=1:3:1", "--duration", "1"]) == 0
-    assert [line.split(":")[0][-6:] for line in capsys.readouterr().out.splitlines()] == ["seed 1", "seed 2", "seed 3"]
+    assert all(row["swept"]["gain"] == row["gain_mw_per_mhz"] for row in rows)  # type: ignore[index]
+    assert json.loads((tmp_path / "runs" / "result.json").read_text()) == rows
+    for number, row in enumerate(rows, 1):
+        assert row["session"] == str(tmp_path / "runs" / f"session-{number}.mcap")
+        plan = Plan(gain_mw_per_mhz=row["gain_mw_per_mhz"], delay_ms=row["delay_ms"], noise_rad=1e-4, duration_s=3)  # type: ignore[arg-type]
+        alone = simulate(plan, str(tmp_path / "alone.mcap"))
+        assert alone.to_json() == {key: row[key] for key in KEYS}
+        assert (tmp_path / "alone.mcap").read_bytes() == Path(str(row["session"])).read_bytes()
+
+
+def test_a_sweep_is_a_table(capsys: Capsys) -> None:
+    arguments = ["cjb", "--sweep", "seed=1:3:1", "--sweep", "deadband=0:0.5:0.5", "--duration", "12"]
+    assert run(dcon(), ["simulate", *arguments]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split() == [
+        "seed",
+        "deadband",
+        "mHz",
+        "frequency",
+        "Hz",
+        "damping",
+        "%",
+        "peak",
+        "MW",
+        "final",
+        "state",
+    ]
+    assert [row.split()[:2] for row in rows] == [[str(seed), band] for seed in (1, 2, 3) for band in ("0", "0.5")]
+    assert all(row.split()[-1] == "ACTIVE" and len(row) == len(head) for row in rows)
+
+
+def test_a_single_run_leaves_its_result_beside_its_session(tmp_path: Path, capsys: Capsys) -> None:
+    (result,) = told(capsys, "cjb", "--duration", "3", "--out", str(tmp_path))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["result.json", "session.mcap"]
+    assert json.loads((tmp_path / "result.json").read_text()) == result
+    assert tuple(result) == (*KEYS, "session")
+
+
+def test_a_mistake_in_one_run_of_a_sweep_is_one_line(capsys: Capsys) -> None:
+    arguments = ["cjb", "--plant", "none", "--sweep", "gain=0:12:6", "--duration", "1"]
+    assert run(dcon(), ["simulate", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err == "dcon: no plant 'none': one of modal, modal-five\n"
 
 
 def test_the_command_saturates_and_a_gain_beyond_the_operators_is_for_simulation_only(capsys: Capsys) -> None:
@@ -136,11 +179,13 @@ def test_five_modes_keep_table_2() -> None:
         (["cjb", "--plant", "modul"], "no plant 'modul': one of modal, "),
         (["cjb", "--fault", "stream-stp"], "no fault 'stream-stp'; did you mean 'stream-stop'?"),
         (["cjb", "--impair", "nothing.ini"], "--impair nothing.ini: neither a file nor a ready profile"),
-        (["cjb", "--sweep", "gain=0:30"], "--sweep gain=0:30: write gain|delay|deadband|seed=FROM:TO:STEP"),
+        (["cjb", "--sweep", "gain=0:30"], "--sweep gain=0:30: write gain|delay|deadband|noise|seed=FROM:TO:STEP"),
         (["cjb", "--sweep", "gain=0:30:0"], "write gain"),
         (["cjb", "--sweep", "gain=-3:30:3"], "write gain"),
         (["cjb", "--sweep", "gain=0:nan:3"], "write gain"),
-        (["cjb", "--sweep", "noise=0:30:3"], "write gain"),
+        (["cjb", "--sweep", "plant=0:30:3"], "write gain"),
+        (["cjb", "--sweep", "seed=0:1:0.5"], "--sweep seed=0:1:0.5: seeds are whole numbers"),
+        (["cjb", "--sweep", "gain=0:1:1", "--sweep", "gain=2:3:1"], "--sweep gain: given twice"),
         (["cjb", "--sweep", "seed=1:200:1", "--sweep", "gain=0:15:0.1"], "--sweep: more than 10000 runs"),
         (["bc-us-separation", "--plant", "modal-five"], "plant 'modal-five' has no condition 'bc-us-separated'"),
         (["cjb", "--impair", "typo.ini"], "--impair: no PMU is called N9; there are N1, N2"),

@@ -127,6 +127,7 @@ def test_scenarios_by_name() -> None:
         assert all(0 <= pulse.start_s < pulse.stop_s <= scene.duration_s for pulse in scene.pulses)
         if scene.ringdown_s:
             first, last = scene.ringdown_s
-            assert max(pulse.stop_s for pulse in scene.pulses) + 1 <= first < last <= scene.duration_s
+            ends = [pulse.stop_s for pulse in scene.pulses] + ([scene.loss.start_s] if scene.loss else [])
+            assert max(ends) + 1 <= first < last <= scene.duration_s
     with pytest.raises(SettingsError, match="no scenario 'quake'"):
         scenario("quake")

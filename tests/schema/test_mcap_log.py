@@ -246,7 +246,7 @@ def test_full_disk_anywhere_is_one_line_and_what_was_flushed_is_readable(tmp_pat
         disk = FullDisk(capacity)
         with pytest.raises(SourceError, match=r"^session\.mcap: cannot write: No space left on device$"):
             small_log(disk)
-        if capacity >= 8:
+        if disk.getvalue():  # else not even the header found room
             records, _ = read(tmp_path / "full.mcap", disk.getvalue())
             expected = [time for _, end, times in spans if end <= capacity for time in times]
             assert ticks_of(records) == expected

@@ -1,0 +1,104 @@
+"""The parts of a session that was rotated: how they are named, how they know each other, which belong together.
+
+Part k of ``session.mcap`` is ``session.part2.mcap``, ``session.part3.mcap``, ... beside it. Each is whole in itself:
+initialisation file, configurations and names are in every one. What makes them one session is the ``session`` key of
+their metadata; names alone do not, for an earlier session may have left its own parts behind.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from pmutools.errors import SourceError
+from pmutools.schema.log_reader import LogMessage, LogMetadata, LogReader
+
+SESSION = "session"
+"""Name of the metadata record that makes an MCAP file a session log; and its key that all parts of one share."""
+
+
+Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+"""A session: one file, or its parts."""
+
+
+class Part(NamedTuple):
+    """One file of a session."""
+
+    log: LogReader
+    session: str
+    """"" where the log does not say: then there is only this file."""
+    number: int
+    after: str
+    """Name of the part before; "" for the first."""
+    unlogged: int
+    """Ticks that were not logged just before this part."""
+
+
+def part_path(first: str | os.PathLike[str], number: int) -> Path:
+    """Where part ``number`` of the session that begins in ``first`` is."""
+    path = Path(first)
+    return path if number == 1 else path.with_name(f"{path.stem}.part{number}{path.suffix}")
+
+
+def part_of(path: str | os.PathLike[str]) -> Part:
+    """Raises SourceError for a file that cannot be read; one that says nothing of parts is a first and only part."""
+    log = LogReader(path)
+    values: dict[str, str] = {}
+    for record in log.records(()):
+        if isinstance(record, LogMetadata) and record.name == SESSION:
+            values.update(record.values)
+            break
+        if isinstance(record, LogMessage):
+            break
+    return Part(
+        log,
+        values.get(SESSION, ""),
+        _count(values.get("part"), 1),
+        values.get("continues", ""),
+        _count(values.get("unlogged_ticks"), 0),
+    )
+
+
+def parts_of(paths: Paths) -> list[Part]:
+    """The parts to be read, in order.
+
+    A first part brings those that continue it, as far as they are there; a later one stands alone; several are taken
+    as named, whatever their order. Raises SourceError for files that are not parts of one session, or one named twice.
+    """
+    named = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
+    parts = sorted(map(part_of, named), key=lambda part: part.number)
+    if len(parts) > 1:
+        first = parts[0]
+        for before, part in pairwise(parts):
+            if not part.session or part.session != first.session:
+                raise SourceError(f"{part.log.path}: not of the same session as {first.log.path}; read one at a time")
+            if part.number == before.number:
+                raise SourceError(f"{part.log.path}: part {part.number} of the session twice, also {before.log.path}")
+        return parts
+    (only,) = parts
+    if only.number == 1 and only.session:
+        parts += _followers(only)
+    return parts
+
+
+def _followers(first: Part) -> list[Part]:
+    found: list[Part] = []
+    while (path := part_path(first.log.path, len(found) + 2)).is_file():
+        try:
+            part = part_of(path)
+        except SourceError:
+            break
+        if (part.session, part.number) != (first.session, len(found) + 2):
+            break
+        found.append(part)
+    return found
+
+
+def _count(text: str | None, default: int) -> int:
+    try:
+        return default if text is None else int(text)
+    except ValueError:
+        return default
