@@ -18,7 +18,7 @@ import pmutools
 from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surroundings
 from dcon.session import codec
 from dcon.session.codec import Pdci, Timing, Watchdog
-from dcon.session.parts import SESSION, Part, Paths, parts_of
+from dcon.session.parts import SESSION, Part, Paths, is_apart, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.log_writer import LogWriter
@@ -240,22 +240,21 @@ class SessionReader:
     def groups(self, messages: Collection[str]) -> Iterator[TickMessages]:
         """The wanted messages (names of the table) of each tick, decoded; memory is bounded by a tick and a chunk."""
         self.incomplete_ticks = 0
-        for part in self.parts:
-            part.log.damage = Damage()
+        self.reset_damage()
         before: Part | None = None
         loss = False
         for part in self.parts:
-            loss |= before is not None and self._is_apart(before, part)
+            loss |= before is not None and is_apart(before, part)
             for group in self._groups(part.log, messages):
                 group.after_loss |= loss
                 loss = False
                 yield group
             before = part
 
-    @staticmethod
-    def _is_apart(before: Part, part: Part) -> bool:
-        """Whether anything is missing between two parts."""
-        return bool(before.log.damage or part.unlogged or part.number != before.number + 1)
+    def reset_damage(self) -> None:
+        """Before an iteration."""
+        for part in self.parts:
+            part.log.damage = Damage()
 
     def _groups(self, log: LogReader, messages: Collection[str]) -> Iterator[TickMessages]:
         group: TickMessages | None = None

@@ -84,6 +84,11 @@ def parts_of(paths: Paths) -> list[Part]:
     return parts
 
 
+def is_apart(before: Part, part: Part) -> bool:
+    """Whether anything is missing between two parts, the first of which has been read to its end."""
+    return bool(before.log.damage or part.unlogged or part.number != before.number + 1)
+
+
 def _followers(first: Part) -> list[Part]:
     found: list[Part] = []
     while (path := part_path(first.log.path, len(found) + 2)).is_file():

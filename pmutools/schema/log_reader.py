@@ -7,7 +7,6 @@ from record to record loses its footing, the next chunk is found by its signatur
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -16,9 +15,7 @@ from typing import IO, Any, NamedTuple
 from pmutools.errors import SourceError
 from pmutools.schema import mcap_records as raw
 from pmutools.schema.descriptors import message_class, short_name
-from pmutools.schema.mcap_records import DamagedRecordError, Op
-
-_MESSAGE = struct.Struct("<HIQQ")
+from pmutools.schema.mcap_records import MESSAGE_RECORD, DamagedRecordError, Op
 
 
 class LogChannel(NamedTuple):
@@ -218,27 +215,31 @@ class _Walk:
     def _walk(self, data: bytes) -> Iterator[LogMessage]:
         """Records inside a chunk or the summary."""
         at, end = 0, len(data)
+        wanted, channels = self.wanted, self.channels
+        unpack, head, message_head = MESSAGE_RECORD.unpack_from, raw.RECORD_HEAD.size, MESSAGE_RECORD.size
         while at < end:
-            if end - at < raw.RECORD_HEAD.size:
+            if end - at < head:
                 raise DamagedRecordError("record head")
-            opcode, length = raw.RECORD_HEAD.unpack_from(data, at)
-            at += raw.RECORD_HEAD.size
-            stop = at + length
-            if stop > end:
-                raise DamagedRecordError("record length")
-            if opcode == Op.MESSAGE:
-                if length < _MESSAGE.size:
+            if data[at] == Op.MESSAGE:
+                if end - at < message_head:
                     raise DamagedRecordError("message head")
-                number, _, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(data, at)
-                channel = self.channels.get(number)
+                _, length, number, _, log_time_ns, publish_time_ns = unpack(data, at)
+                stop = at + head + length
+                if stop > end or length < message_head - head:
+                    raise DamagedRecordError("record length")
+                channel = channels.get(number)
                 if channel is None:
                     self.damage.orphans += 1
                 else:
                     self.found += 1
-                    if self.wanted is None or channel.message in self.wanted:
-                        yield LogMessage(channel, log_time_ns, publish_time_ns, data[at + _MESSAGE.size : stop])
+                    if wanted is None or channel.message in wanted:
+                        yield LogMessage(channel, log_time_ns, publish_time_ns, data[at + message_head : stop])
             else:
-                self._define(opcode, data[at:stop])
+                opcode, length = raw.RECORD_HEAD.unpack_from(data, at)
+                stop = at + head + length
+                if stop > end:
+                    raise DamagedRecordError("record length")
+                self._define(opcode, data[at + head : stop])
             at = stop
 
     def _define(self, opcode: int, body: bytes) -> None:

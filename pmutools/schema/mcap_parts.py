@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from pmutools.schema.mcap_records import CHUNK_HEAD, FOOTER, RECORD_HEAD, Op
+from pmutools.schema.mcap_records import CHUNK_HEAD, FOOTER, MESSAGE_RECORD, RECORD_HEAD, Op
 
-_MESSAGE_RECORD = struct.Struct("<BQHIQQ")
-_MESSAGE_HEAD = _MESSAGE_RECORD.size - RECORD_HEAD.size
+_MESSAGE_HEAD = MESSAGE_RECORD.size - RECORD_HEAD.size
 _INDEX_ENTRY = struct.Struct("<QQ")
 _INDEX_HEAD = struct.Struct("<BQHI")
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
@@ -52,7 +51,7 @@ class OpenChunk:
 
     def add(self, channel: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         length = _MESSAGE_HEAD + len(data)
-        self.parts.append(_MESSAGE_RECORD.pack(Op.MESSAGE, length, channel, 0, log_time_ns, publish_time_ns))
+        self.parts.append(MESSAGE_RECORD.pack(Op.MESSAGE, length, channel, 0, log_time_ns, publish_time_ns))
         self.parts.append(data)
         self.index.setdefault(channel, []).append(_INDEX_ENTRY.pack(log_time_ns, self.size))
         self.size += RECORD_HEAD.size + length

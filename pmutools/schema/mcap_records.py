@@ -16,6 +16,8 @@ MAX_RECORD_BYTES = 256 << 20
 """No record or chunk beyond this is loaded; mcap writers make chunks of 1 to 8 MiB."""
 
 RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_RECORD = struct.Struct("<BQHIQQ")
+"""Head of the record and of the message in it: channel, sequence, log time, publish time."""
 CHUNK_HEAD = struct.Struct("<QQQI")
 FOOTER = struct.Struct("<BQQQI")
 _SIGNATURES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
