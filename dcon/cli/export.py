@@ -6,15 +6,14 @@ import json
 
 import click
 
+from dcon.session.tables import TABLES
 from pmutools.cli.shell import Exit, Talk, common
-
-TABLES = ("tick", "instance", "pmu", "event")
 
 
 @click.command(name="export", short_help="A session log as a table.")
 @click.argument("sessions", metavar="SESSION...", nargs=-1, required=True)
 @click.argument("output", metavar="OUT")
-@click.option("--table", type=click.Choice(TABLES), default="tick", show_default=True)
+@click.option("--table", type=click.Choice(list(TABLES)), default="tick", show_default=True)
 @common
 def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, quiet: bool, verbose: int) -> int:
     """Write one table of a session log to OUT: .csv, .parquet, .arrow or .jsonl.

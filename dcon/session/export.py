@@ -81,9 +81,10 @@ class _Rows:
             yield batch
 
     def _rows(self) -> Iterator[Row]:
+        rows = self._table.rows(self._reader)
         for group in self._reader.groups(self._table.messages):
             self.gaps += group.after_loss
-            yield from self._table.rows(self._reader, group)
+            yield from rows(group)
 
 
 Sink = Callable[[Path, Sequence[Column], dict[str, str]], AbstractContextManager[Write]]

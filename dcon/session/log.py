@@ -267,13 +267,14 @@ class SessionReader:
                 continue
             if entry.channel.message == "PmuFrame" and not message.tick_ns:
                 continue  # no tick consumed it
-            if group is None or message.tick_ns != group.tick_ns:
+            kind = str(entry.channel.message)
+            tick_ns = getattr(message, _TIMES[kind])
+            if group is None or tick_ns != group.tick_ns:
                 if group is not None:
                     yield group
-                group = TickMessages(message.tick_ns, after_loss=log.damage.losses > losses, configs=configs)
+                group = TickMessages(tick_ns, after_loss=log.damage.losses > losses, configs=configs)
                 configs = []
                 losses = log.damage.losses
-            kind = str(entry.channel.message)
             if kind == "PmuFrame":
                 group.frames.append((name_of(entry.channel.topic), message))
             else:
@@ -294,6 +295,8 @@ class SessionReader:
         return None
 
 
+_TIMES = {name: "tick_ns" if name == "PmuFrame" else message.fields[0].name for name, message in MESSAGES.items()}
+"""Field of each message that names its tick; of one that belongs to none, its time."""
 TICK_MESSAGES = frozenset(("PmuFrame", "Setting", "Tick", "Instance", "Event", "Timing", "Pdci"))
 """What a :class:`LoggedTick` is made of."""
 

@@ -5,12 +5,15 @@ An unknown number (NaN) is a null. ``tick``: one row a tick, the columns of ever
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from dcon.session.log import SessionReader, TickMessages
+from pmutools.schema.messages import MESSAGES, Field
 
 ColumnType = Literal["int64", "uint64", "float64", "string", "bool"]
 Row = tuple[int | float | str | bool | None, ...]
@@ -22,13 +25,16 @@ class Column(NamedTuple):
     nullable: bool = True
 
 
+Rows = Callable[[TickMessages], Iterator[Row]]
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
-    """``messages`` are those (names of the schema table) that ``rows`` looks at; rows never mix two ticks."""
+    """``messages`` are those (names of the schema table) that ``rows`` looks at, tick by tick."""
 
     messages: frozenset[str]
     columns: Callable[[SessionReader], tuple[Column, ...]]
-    rows: Callable[[SessionReader, TickMessages], Iterator[Row]]
+    rows: Callable[[SessionReader], Rows]
 
 
 def _known(value: float) -> float | None:
@@ -164,9 +170,78 @@ def _event_rows(_: SessionReader, group: TickMessages) -> Iterator[Row]:
         yield group.tick_ns, "event", event.name, event.subject or None, event.detail or None, None
 
 
-TABLES: dict[str, Table] = {
-    "tick": Table(frozenset(("Tick", "Timing", "Pdci")), _tick_columns, _tick_rows),
-    "instance": Table(frozenset(("Instance",)), _instance_columns, _instance_rows),
-    "pmu": Table(frozenset(("PmuFrame",)), _pmu_columns, _pmu_rows),
-    "event": Table(frozenset(("Event", "Setting")), _event_columns, _event_rows),
+def _flag_columns(_: SessionReader) -> tuple[Column, ...]:
+    return (
+        Column("tick_ns", "int64", nullable=False),
+        Column("flag", "string", nullable=False),
+        Column("up", "bool", nullable=False),
+    )
+
+
+def _flag_rows(session: SessionReader) -> Rows:
+    """One row each time that a flag rises or falls."""
+    known = 0
+
+    def rows(group: TickMessages) -> Iterator[Row]:
+        nonlocal known
+        tick = group.one("Tick")
+        if tick is None:
+            return
+        changed, known = known ^ tick.flags, tick.flags
+        for bit in range(changed.bit_length()):
+            if changed >> bit & 1:
+                name = session.flags[bit] if bit < len(session.flags) else str(bit)
+                yield group.tick_ns, name, bool(known >> bit & 1)
+
+    return rows
+
+
+_COLUMN_TYPES: dict[str, ColumnType] = {
+    "double": "float64",
+    "uint64": "uint64",
+    "bool": "bool",
+    "string": "string",
+    "bytes": "string",
 }
+
+
+def _message_table(name: str) -> Table:
+    """A message as it is: a column a field; a list as JSON, bytes as hexadecimal digits."""
+    fields = MESSAGES[name].fields
+
+    def columns(_: SessionReader) -> tuple[Column, ...]:
+        return tuple(
+            Column(field.name, "string" if field.repeated else _COLUMN_TYPES.get(field.type, "int64"))
+            for field in fields
+        )
+
+    def rows(group: TickMessages) -> Iterator[Row]:
+        for message in group.messages.get(name, ()):
+            yield tuple(_cell(getattr(message, field.name), field) for field in fields)
+
+    return Table(frozenset((name,)), columns, lambda _: rows)
+
+
+def _cell(value: Any, field: Field) -> int | float | str | bool | None:
+    if field.repeated:
+        return json.dumps([_cell(each, field._replace(repeated=False)) for each in value], ensure_ascii=False)
+    if field.type == "bytes":
+        return str(value.hex())
+    known: int | float | str | bool | None = _known(value) if isinstance(value, float) else value
+    return known
+
+
+def _each(rows: Callable[[SessionReader, TickMessages], Iterator[Row]]) -> Callable[[SessionReader], Rows]:
+    return lambda session: partial(rows, session)
+
+
+_OWN: dict[str, Table] = {
+    "tick": Table(frozenset(("Tick", "Timing", "Pdci")), _tick_columns, _each(_tick_rows)),
+    "instance": Table(frozenset(("Instance",)), _instance_columns, _each(_instance_rows)),
+    "pmu": Table(frozenset(("PmuFrame",)), _pmu_columns, _each(_pmu_rows)),
+    "event": Table(frozenset(("Event", "Setting")), _event_columns, _each(_event_rows)),
+    "flag": Table(frozenset(("Tick",)), _flag_columns, _flag_rows),
+}
+_TOPICS = {message.topic.removeprefix("/dcon/"): name for name, message in MESSAGES.items() if name != "PmuFrame"}
+TABLES: dict[str, Table] = _OWN | {topic: _message_table(name) for topic, name in _TOPICS.items() if topic not in _OWN}
+"""Every topic has one; the first four are made for reading, ``flag`` is made of ``/dcon/tick``."""

@@ -13,11 +13,25 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.sessions import FLAGS, INSTANCES, PERIOD_NS, PMUS, Tick, bits, random_ticks, write_session
+from support.sessions import (
+    FLAGS,
+    INSTANCES,
+    PERIOD_NS,
+    PMUS,
+    T0,
+    Tick,
+    bits,
+    open_session,
+    random_ticks,
+    write_session,
+)
 
 from dcon.session import export as export_module
+from dcon.session.codec import Watchdog
 from dcon.session.export import export
+from dcon.session.tables import TABLES
 from pmutools.errors import SettingsError, SourceError
+from pmutools.schema.messages import MESSAGES
 
 FIRST = [
     *("tick_ns", "state", "mode", "active_instance", "gain_mw_per_mhz", "delta_f_mhz", "command_mw"),
@@ -76,7 +90,7 @@ def read_csv(path: Path, columns: dict[str, str]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".arrow", ".csv", ".csv.gz", ".jsonl"])
-@pytest.mark.parametrize("table", ["tick", "instance", "pmu", "event"])
+@pytest.mark.parametrize("table", ["tick", "instance", "pmu", "event", "flag", "setting", "timing", "pdci"])
 def test_every_format_holds_the_same_rows(
     session: Path, tmp_path: Path, table: str, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,7 +98,7 @@ def test_every_format_holds_the_same_rows(
     reference = tmp_path / "reference.parquet"
     summary = export(session, reference, table)
     rows = pq.read_table(reference).to_pylist()
-    assert summary.rows == len(rows) > 100 and summary.gaps == 0 and not summary.damage
+    assert summary.rows == len(rows) > 64 and summary.gaps == 0 and not summary.damage
     assert pq.ParquetFile(reference).metadata.num_row_groups == math.ceil(len(rows) / 64)
 
     out = tmp_path / f"out{suffix}"
@@ -170,6 +184,79 @@ def test_event_rows(session: Path, tmp_path: Path) -> None:
     assert bits(tuple(tuple(row.values()) for row in rows)) == bits(tuple(expected))
 
 
+def test_flag_rows_are_the_changes(session: Path, tmp_path: Path) -> None:
+    export(session, tmp_path / "f.parquet", "flag")
+    names = [*FLAGS, *map(str, range(len(FLAGS), 64))]
+    expected, up = [], 0
+    for tick in TICKS:
+        flags = tick.record.flags
+        expected += [
+            (tick.record.tick_ns, name, bool(flags >> bit & 1))
+            for bit, name in enumerate(names)
+            if (flags ^ up) >> bit & 1
+        ]
+        up = flags
+    rows = pq.read_table(tmp_path / "f.parquet").to_pylist()
+    assert [tuple(row.values()) for row in rows] == expected
+
+
+def test_messages_as_they_are(session: Path, tmp_path: Path) -> None:
+    for table, values in (
+        ("setting", [(t.record.tick_ns, o.name, none_if_nan(o.value)) for t in TICKS for o in t.orders]),
+        ("timing", [(t.record.tick_ns, *map(none_if_nan, t.timing)) for t in TICKS if t.timing]),
+        (
+            "pdci",
+            [
+                (t.record.tick_ns, p.time_ns, none_if_nan(p.power_mw), p.in_service, p.dcon_enabled)
+                for t in TICKS
+                if (p := t.pdci)
+            ],
+        ),
+    ):
+        out = tmp_path / f"{table}.parquet"
+        assert export(session, out, table).rows == len(values) > 50
+        assert exact(pq.read_table(out).to_pylist()) == [
+            tuple((name, bits(value)) for name, value in zip(pq.read_schema(out).names, row, strict=True))
+            for row in values
+        ]
+
+
+def test_the_watchdogs_table(tmp_path: Path) -> None:
+    with open_session(tmp_path / "s.mcap") as log:
+        log.watchdog(Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5), ("udp", 1.0))))
+        log.tick(TICKS[0].record)
+        log.watchdog(Watchdog(T0 + 5, True))
+    assert export(tmp_path / "s.mcap", tmp_path / "w.jsonl", "watchdog").rows == 2
+    first, last = map(json.loads, (tmp_path / "w.jsonl").read_text().splitlines())
+    assert first == {
+        "time_ns": T0,
+        "relays_closed": False,
+        "estop": True,
+        "latched": False,
+        "reason": "E-stop",
+        "heartbeat": '["control", "udp"]',
+        "heartbeat_age_ms": "[3.5, 1.0]",
+    }
+    assert (last["time_ns"], last["relays_closed"], last["heartbeat"]) == (T0 + 5, True, "[]")
+
+
+def test_every_topic_has_its_table() -> None:
+    topics = {message.topic.rpartition("/")[2] for message in MESSAGES.values()} - {"frame"}
+    assert set(TABLES) == topics | {"pmu", "flag"}
+
+
+def test_a_damaged_log_exports_every_table(session: Path, tmp_path: Path) -> None:
+    data = bytearray(session.read_bytes())
+    at = data.index(b"\x04\x00\x00\x00zstd", len(data) // 4) + 500
+    data[at : at + 3] = b"rot"
+    (tmp_path / "damaged.mcap").write_bytes(bytes(data[:-2000]))
+    for table in TABLES:
+        summary = export(tmp_path / "damaged.mcap", tmp_path / f"{table}.csv", table)
+        assert summary.damage.cut and summary.damage.records == 1
+        assert summary.gaps == (0 if table == "watchdog" else 1)
+        assert table == "watchdog" or summary.rows > 10
+
+
 def test_gaps_are_counted(session: Path, tmp_path: Path) -> None:
     data = bytearray(session.read_bytes())
     at = data.index(b"\x04\x00\x00\x00zstd", len(data) // 4) + 500
@@ -182,7 +269,7 @@ def test_gaps_are_counted(session: Path, tmp_path: Path) -> None:
 
 def test_mistakes_are_one_line_and_write_nothing(session: Path, tmp_path: Path) -> None:
     out = tmp_path / "t.parquet"
-    with pytest.raises(SettingsError, match="no table 'ticks'; there are tick, instance, pmu, event"):
+    with pytest.raises(SettingsError, match="no table 'ticks'; there are tick, instance, pmu, event, flag, setting"):
         export(session, out, "ticks")
     with pytest.raises(SettingsError, match=r"t\.xlsx: unknown suffix '\.xlsx'; use one of \.csv, "):
         export(session, tmp_path / "t.xlsx")

@@ -107,7 +107,7 @@ def test_wanted_fields_only() -> None:
 
 
 def test_what_our_writer_would_not_write() -> None:
-    """Lists that are not packed, fields twice, in any order, of a newer version, groups, varints longer than need be."""
+    """Lists that are not packed, fields twice, in any order, of a newer version, groups, varints too long."""
     rng = random.Random(2)
     tick = message_class("Tick")
     odd = [
