@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import errno
 import io
-import itertools
 import os
+import random
 import signal
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -122,21 +123,35 @@ def test_every_topic_is_decoded_by_any_mcap_reader(tmp_path: Path) -> None:
     assert seen["/dcon/event"] == sum(len(tick.record.events) for tick in ticks)
 
 
-def test_a_cut_loses_the_end_only_and_says_so(tmp_path: Path) -> None:
-    ticks = random_ticks(240)
+def test_a_cut_anywhere_loses_the_end_only_and_says_so(tmp_path: Path) -> None:
+    """To the last tick of the last whole chunk, which spans a second."""
+    from mcap.records import ChunkIndex
+    from mcap.stream_reader import StreamReader
+
+    ticks = random_ticks(150)
     path = write_session(tmp_path / "s.mcap", ticks)
     data = path.read_bytes()
     expected = [bits(tuple(tick)) for tick in ticks]
-    lengths = set()
-    for cut in range(len(data) // 3, len(data), 997):
+    index = [record for record in StreamReader(io.BytesIO(data)).records if isinstance(record, ChunkIndex)]
+    ends = [record.chunk_start_offset + record.chunk_length for record in index]
+    cuts = {end + by for end in ends for by in range(-3, 4)} | set(random.Random(1).sample(range(len(data)), 40))
+    counts: dict[int, set[int]] = {}
+    for cut in sorted(cuts):
         path.write_bytes(data[:cut])
-        reader = SessionReader(path)
+        try:
+            reader = SessionReader(path)
+        except SourceError:
+            assert cut < data.index(INI.encode())  # not even the metadata are whole
+            continue
         back = list(reader.ticks())
-        assert [strip(tick) for tick in back] == expected[: len(back)]
+        assert [strip(tick) for tick in back] == expected[: len(back)], cut
+        counts.setdefault(sum(end <= cut for end in ends), set()).add(len(back))
         assert reader.damage.cut and not any(tick.after_loss for tick in back)
         assert reader.incomplete_ticks == 0, "chunks end between ticks"
-        lengths.add(len(back))
-    assert len(lengths) > 2
+    of_chunks = [counts[number].pop() for number in range(len(ends) + 1)]
+    assert not any(counts.values()), "what is read depends on the whole chunks alone"
+    assert of_chunks[0] == 0 and of_chunks[-1] == 150
+    assert all(58 <= b - a <= 60 for a, b in pairwise(of_chunks[:-1]))
 
 
 def test_rot_loses_whole_ticks_and_marks_the_first_after_them(tmp_path: Path) -> None:
@@ -150,7 +165,7 @@ def test_rot_loses_whole_ticks_and_marks_the_first_after_them(tmp_path: Path) ->
     assert 178 <= len(back) <= 182, "a chunk is a second"
     after = [tick.record.tick_ns for tick in back if tick.after_loss]
     assert len(after) == 1
-    gaps = [b.record.tick_ns for a, b in itertools.pairwise(back) if b.record.tick_ns - a.record.tick_ns > PERIOD_NS]
+    gaps = [b.record.tick_ns for a, b in pairwise(back) if b.record.tick_ns - a.record.tick_ns > PERIOD_NS]
     assert gaps == after
     assert reader.damage.records == 1 and not reader.damage.cut
 
