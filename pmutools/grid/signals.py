@@ -26,12 +26,13 @@ class Bus(NamedTuple):
     """Voltage at one bus: angle in the frame of nominal frequency (it turns, and is not wrapped), deviation, rate.
 
     These swing against other buses. What all share is beside them: a place that swings less with its bus has it whole.
+    It is -0.0 where there is none, for to add that changes nothing, not even a sign.
     """
 
     angle_rad: float
     deviation_hz: float
     rocof_hz_s: float
     voltage_pu: float = 1.0
-    common_rad: float = 0.0
-    common_hz: float = 0.0
-    common_hz_s: float = 0.0
+    common_rad: float = -0.0
+    common_hz: float = -0.0
+    common_hz_s: float = -0.0

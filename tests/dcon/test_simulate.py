@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import cmath
 import json
+import math
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from dcon.cli import dcon
+from dcon.core.differentiator import PAPER_60, response
+from dcon.session.columns import read_columns
 from dcon.sim.delays import split
 from dcon.sim.plan import Plan
-from dcon.sim.simulate import simulate
+from dcon.sim.simulate import SCHEDULE_MW, simulate
 from pmutools.cli.shell import run
+from pmutools.grid.modal import SEPARATED_FROM_ALBERTA
+from pmutools.grid.scenarios import scenario
+from pmutools.grid.theory import closed_loop_eigenvalue, frequency_and_damping
+from pmutools.timebase import NS
 
 Capsys = pytest.CaptureFixture[str]
 KEYS = (
     *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "seed", "duration_s", "mode", "open_loop"),
     *("peak_command_mw", "final_state", "events"),
 )
+
+
+def differentiator(s: complex) -> complex:
+    """The controller's, over true frequency."""
+    return response(PAPER_60, cmath.exp(s / 60)) * 2 * math.pi / s
 
 
 def told(capsys: Capsys, *arguments: str) -> list[dict[str, object]]:
@@ -163,6 +176,33 @@ def test_bc_us_separation_gains_the_papers_damping() -> None:
     assert outcome.mode is not None and outcome.open_loop is not None
     assert outcome.open_loop.damping_percent == pytest.approx(0.0, abs=0.01)
     assert outcome.mode.damping_percent == pytest.approx(4.1, abs=0.1)
+
+
+def test_bc_alberta_separation_leaves_one_slower_mode_that_is_damped() -> None:
+    """Figure 7's case; frequency, damping and residue of this plant are assumed."""
+    outcome = simulate(Plan("bc-alberta-separation", gain_mw_per_mhz=6, duration_s=20.5))
+    assert outcome.mode is not None and outcome.open_loop is not None
+    assert outcome.open_loop[:2] == pytest.approx((0.32, 8.0), abs=1e-3)
+    (mode,) = SEPARATED_FROM_ALBERTA
+    root = closed_loop_eigenvalue(SEPARATED_FROM_ALBERTA, mode, 6, feedback=differentiator)
+    hertz, damping = frequency_and_damping(root)
+    assert outcome.mode[:2] == pytest.approx((hertz, 100 * damping), abs=2e-3)
+    assert outcome.mode.damping_percent > 10
+
+
+def test_probing_reaches_the_line_and_is_told_from_the_command(tmp_path: Path) -> None:
+    outcome = simulate(Plan("probing", gain_mw_per_mhz=12, duration_s=25), str(tmp_path / "s.mcap"))
+    session = read_columns(tmp_path / "s.mcap")
+    signal = scenario("probing").multisine
+    assert signal is not None and outcome.final_state == "ACTIVE"
+    line_mw = session.tick.pdci_mw - SCHEDULE_MW
+    assert set(line_mw[:200]) == {0.0}
+    for k in range(600, 1500, 37):
+        # at tick k the line follows the command of the tick before, 11 ms later, and the signal at the newest stamp
+        stamp_ns = round((k + 4) * NS / 60)
+        signal_mw = signal.mw(stamp_ns * 60 // NS / 60)
+        assert line_mw[k] == pytest.approx(session.tick.command_mw[k - 1] + signal_mw, abs=1e-9)
+    assert 1 < max(map(abs, outcome.command_mw)) < 20
 
 
 def test_five_modes_keep_table_2() -> None:

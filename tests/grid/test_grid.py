@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 import random
+from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.errors import SettingsError
 from pmutools.grid.grid import MAX_COMMANDS, Grid
+from pmutools.grid.modal import FIVE_MODES
+from pmutools.grid.multisine import Multisine, tones
 from pmutools.grid.plant import build
-from pmutools.grid.scenarios import SCENARIOS, Pulse, Scenario, scenario
-from pmutools.grid.signals import Bus, Drive
+from pmutools.grid.pmu_model import PmuModel, measure, measured_columns
+from pmutools.grid.scenarios import SCENARIOS, GenerationLoss, Pulse, Scenario, scenario
+from pmutools.grid.signals import Bus, Common, Drive
 from pmutools.timebase import NS
 
 START = 1_700_000_000 * NS
@@ -107,6 +114,64 @@ def test_a_probe_is_told_apart_from_the_command() -> None:
     assert halves == [125, -125, 125, -125, 125, -125, 0, 0]
 
 
+def test_a_multisine_is_low_and_has_its_tones_in_whole_periods() -> None:
+    signal = Multisine(5.0, 205.0, 20.0)
+    found = tones(signal)
+    assert len(found) == 16 and found[0].frequency_hz == 0.1 and found[-1].frequency_hz == 5.0
+    cycles = [tone.frequency_hz * signal.period_s for tone in found]
+    assert cycles == pytest.approx([round(count) for count in cycles])
+    assert all(1.1 < b.frequency_hz / a.frequency_hz < 1.5 for a, b in pairwise(found))
+    course = [signal.mw(5 + k / 1000) for k in range(100_000)]
+    assert max(map(abs, course)) == pytest.approx(20.0, rel=0.01)
+    assert max(map(abs, course)) / math.sqrt(sum(mw * mw for mw in course) / len(course)) < 3  # 5.7 if all peaks met
+    assert signal.mw(4.999) == signal.mw(205.0) == 0.0 and signal.mw(5.25) == pytest.approx(signal.mw(105.25))
+    assert tones(signal._replace(seed=2)) != found
+
+
+def test_probing_shows_the_plant() -> None:
+    """Tone by tone, over two periods after the start has died away: the plant's own transfer, held for 1/60 s."""
+    scene = scenario("probing")
+    assert scene.multisine is not None
+    grid = Grid(build("modal-five"), scene, start_ns=START)
+    swing = np.zeros(12_000)
+    for k in range(105 * 60, 305 * 60):
+        grid.advance(START + k * NS // 60)
+        swing[k - 105 * 60] = grid.plant.buses(grid.drive)["north"].deviation_hz * 2
+    for tone in tones(scene.multisine):
+        s = 2j * math.pi * tone.frequency_hz
+        line = 2 * np.mean(swing * np.exp(-s * np.arange(12_000) / 60))
+        given = tone.mw * cmath.exp(1j * (tone.phase_rad - math.pi / 2))  # 105 s are a whole period after the start
+        hold = (1 - cmath.exp(-s / 60)) / (s / 60)
+        expected = -sum(mode.transfer(s) for mode in FIVE_MODES) * hold
+        assert line / given == pytest.approx(expected, rel=0.03), tone.frequency_hz
+
+
+def test_a_loss_in_the_south_is_felt_everywhere_and_there_first() -> None:
+    loss = GenerationLoss(5.0, 1400.0, rocof_hz_s=-0.069, settles_hz=-0.155, lag_s=0.03, swing_share=0.3)
+    for bus, from_s in (("south", 5.0), ("north", 5.03)):
+        assert loss.common(from_s - 1e-9, bus) == Common()
+        assert loss.common(from_s + 1e-9, bus).rocof_hz_s == pytest.approx(-0.069)
+        assert loss.common(60.0, bus).deviation_hz == pytest.approx(-0.155)
+        step_s, at = 1e-4, [loss.common(from_s + 1 + k * 1e-4, bus) for k in (-1, 0, 1)]
+        assert (at[2].angle_rad - at[0].angle_rad) / (2 * step_s) == pytest.approx(2 * math.pi * at[1].deviation_hz)
+        assert (at[2].deviation_hz - at[0].deviation_hz) / (2 * step_s) == pytest.approx(at[1].rocof_hz_s)
+
+
+def test_a_place_that_swings_less_has_the_common_frequency_whole() -> None:
+    """Else the difference of two places would hold a share of it."""
+    grid = Grid(build("modal"), scenario("south-generation-loss"), start_ns=START)
+    grid.advance(START + 30 * NS)
+    buses = grid.buses()
+    assert abs(buses["north"].deviation_hz) < 1e-3 and buses["north"].common_hz == pytest.approx(-0.155, abs=1e-4)
+    near, far = (PmuModel("x", 1, "north", swing=swing) for swing in (1.0, 0.5))
+    difference = measure(near, buses, 0, 0).frequency_hz - measure(far, buses, 0, 0).frequency_hz
+    assert difference == pytest.approx(0.5 * buses["north"].deviation_hz, abs=1e-12)
+    course = np.array([buses["north"]])
+    *_, frequency_hz, rocof_hz_s = measured_columns(far, course, range(1))
+    report = measure(far, buses, 0, 0)
+    assert (frequency_hz[0], rocof_hz_s[0]) == pytest.approx((report.frequency_hz, report.rocof_hz_s), abs=1e-12)
+
+
 def test_random_load_is_seeded() -> None:
     def swing(seed: int) -> list[float]:
         grid = Grid(build("modal"), scenario("ambient"), start_ns=START, seed=seed)
@@ -121,7 +186,8 @@ def test_random_load_is_seeded() -> None:
 
 
 def test_scenarios_by_name() -> None:
-    assert {"cjb", "bc-us-separation", "square-pulse", "ambient"} <= set(SCENARIOS)
+    contract = "cjb bc-us-separation bc-alberta-separation square-pulse probing south-generation-loss ambient"
+    assert set(contract.split()) == set(SCENARIOS)
     for name, scene in SCENARIOS.items():
         assert scenario(name) is scene and scene.name == name and scene.text
         assert all(0 <= pulse.start_s < pulse.stop_s <= scene.duration_s for pulse in scene.pulses)
