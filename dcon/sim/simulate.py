@@ -183,9 +183,7 @@ def _run(
     for number in range(round(plan.length_s * engine.params.tick_hz)):
         tick_ns = START_NS + delays.phase_ns + round(number * period)
         while next_stamp <= tick_ns and next_stamp < end_ns:
-            for arrival_ns, name, data in _measure(grid, senders, next_stamp, slot, outcome):
-                heapq.heappush(arrivals, (arrival_ns, order, name, data))
-                order += 1
+            order = _measure(grid, senders, next_stamp, slot, outcome, arrivals, order)
             next_stamp, slot = next(stamps), slot + 1
         frames: dict[str, list[Frame]] = {}
         while arrivals and arrivals[0][0] <= tick_ns:
@@ -219,18 +217,28 @@ def _stamps(plan: Plan) -> Iterator[int]:
 
 
 def _measure(
-    grid: Grid, senders: Sequence[_Sender], stamp_ns: int, slot: int, outcome: Outcome
-) -> Iterator[tuple[int, str, bytes]]:
-    """Move the grid to a reporting instant and send every PMU's frame: (arrival, PMU, bytes) of what gets through."""
+    grid: Grid,
+    senders: Sequence[_Sender],
+    stamp_ns: int,
+    slot: int,
+    outcome: Outcome,
+    arrivals: list[tuple[int, int, str, bytes]],
+    order: int,
+) -> int:
+    """Move the grid to a reporting instant and send every PMU's frame; what gets through goes onto the heap.
+
+    ``order`` counts frames, to keep those that arrive at one time apart; returns the next.
+    """
     grid.advance(stamp_ns)
     buses = grid.buses()
     outcome.swing_mhz.append(_swing_mhz(buses))
     for sender in senders:
         report = measure(sender.pmu, buses, stamp_ns, slot, nominal_hz=sender.stream.nominal_hz)
-        data = sender.stream.data_frame([report])
-        for out in sender.pipeline.apply(slot, data, stamp_ns - START_NS):
+        for out in sender.pipeline.apply(slot, sender.stream.data_frame((report,)), stamp_ns - START_NS):
             if out.fate is Fate.SENT:
-                yield START_NS + out.offset_ns, sender.pmu.name, out.data
+                heapq.heappush(arrivals, (START_NS + out.offset_ns, order, sender.pmu.name, out.data))
+                order += 1
+    return order
 
 
 def _note(outcome: Outcome, record: Record) -> None:

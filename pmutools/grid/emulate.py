@@ -50,10 +50,8 @@ class EmulatedStream:
     def data_frame(self, measurements: Sequence[Measurement]) -> bytes:
         """The frame of one reporting instant, one measurement a PMU."""
         values: list[float] = []
-        for report in measurements:
-            _, va, vb, vc, v1, i1, frequency_hz, rocof_hz_s = report
-            phasors = (*polar(va), *polar(vb), *polar(vc), *polar(v1), *polar(i1))
-            values += (0, *phasors, frequency_hz, rocof_hz_s)
+        for _, va, vb, vc, v1, i1, frequency_hz, rocof_hz_s in measurements:
+            values += (0, *polar(va), *polar(vb), *polar(vc), *polar(v1), *polar(i1), frequency_hz, rocof_hz_s)
         soc, fracsec = timebase.from_ns(measurements[0].time_ns, self.config.time_base)
         packer, head = self._packing
         return sealed(packer.pack(*head, soc, fracsec, *values, 0)[:-CHK_SIZE])

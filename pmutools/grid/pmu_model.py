@@ -71,16 +71,9 @@ def measure(
         magnitude *= 1 + pmu.noise_pu * normal(pmu.seed, str(pmu.idcode), "magnitude", slot)
     v1 = cmath.rect(magnitude, angle)
     va, vb, vc = v1 * _ROTATE[0], v1 * _ROTATE[1], v1 * _ROTATE[2]
-    return Measurement(
-        time_ns=time_ns,
-        va=va,
-        vb=vb,
-        vc=vc,
-        v1=v1,
-        i1=cmath.rect(pmu.current_a, angle - 0.2),
-        frequency_hz=nominal_hz + pmu.swing * bus.deviation_hz + bus.common_hz,
-        rocof_hz_s=pmu.swing * bus.rocof_hz_s + bus.common_hz_s,
-    )
+    i1 = cmath.rect(pmu.current_a, angle - 0.2)
+    frequency_hz = nominal_hz + pmu.swing * bus.deviation_hz + bus.common_hz
+    return Measurement(time_ns, va, vb, vc, v1, i1, frequency_hz, pmu.swing * bus.rocof_hz_s + bus.common_hz_s)
 
 
 def measured_columns(
