@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import cmath
-import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from dcon.core.sequence import sequences
@@ -14,6 +11,7 @@ from pmutools.c37118 import Frame, StreamConfig
 from pmutools.c37118.frames import Data, unpack_data
 from pmutools.c37118.layout import Layout, layout_of
 from pmutools.errors import SettingsError
+from pmutools.schema.frame_encoder import FrameEncoder
 from pmutools.schema.pmu_log import PmuFrame, pmu_frame
 
 _ABSENT = complex(math.nan, math.nan)
@@ -30,10 +28,7 @@ class Binding:
     station: int
     voltage: tuple[int, ...]
     """Columns of V1, or of VA, VB and VC."""
-    places: tuple[int, ...]
-    """Of their magnitudes among a frame's values, where all are polar floats as they stand; else empty."""
-    whole: tuple[int, ...]
-    """The same of all phasors, where the frame is one station and has nothing but such phasors; else empty."""
+    encoder: FrameEncoder = field(compare=False)
 
     def read(self, frame: Frame) -> Reading | None:
         """A data frame as the controller sees it; None where it is not of this configuration."""
@@ -79,6 +74,22 @@ class Reading(NamedTuple):
     frame: Frame
     data: Data
     sample: Sample
+
+    @property
+    def name(self) -> str:
+        return self.binding.name
+
+    @property
+    def time_ns(self) -> int:
+        return self.sample.time_ns
+
+    @property
+    def arrival_ns(self) -> int | None:
+        return self.frame.arrival_ns
+
+    def encode(self, tick_ns: int = 0) -> bytes:
+        """The frame's message in a log (:class:`~pmutools.schema.pmu_log.Loggable`)."""
+        return self.binding.encoder.encode(self.frame, self.data, self.sample.v1, tick_ns)
 
     def entry(self) -> PmuFrame:
         """The frame as a log entry."""
@@ -163,18 +174,7 @@ def bind(
             raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
         columns.append(first + channels.index(wanted))
     layout = layout_of(config)
-    slots = layout.slots
-    alone = len(slots) == 1 and not slots[0].analog_columns and not slots[0].digitals
-    whole = _places(layout, slots[0].phasor_columns) if alone else ()
-    return Binding(name, config, layout, index, tuple(columns), _places(layout, columns), whole)
-
-
-def _places(layout: Layout, columns: Iterable[int]) -> tuple[int, ...]:
-    """Where the phasors' magnitudes are, if all are polar floats that mean what they say."""
-    slots = [layout.phasors[column] for column in columns]
-    if all(slot.polar and slot.floating and slot.factor == 1 and not slot.angle_offset_rad for slot in slots):
-        return tuple(slot.first for slot in slots)
-    return ()
+    return Binding(name, config, layout, index, tuple(columns), FrameEncoder(name, layout, index))
 
 
 def _station(name: str, config: StreamConfig, station: str | None) -> int:

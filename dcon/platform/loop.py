@@ -214,7 +214,7 @@ class Platform:
         configs, self._configs = self._configs, []
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
-        log.tick(tick.record, tick.frames, orders, timing=timing)
+        log.tick(tick.record, tick.readings, orders, timing=timing)
 
     def _receive_until(self, deadline_ns: int) -> None:
         """Receive and parse until shortly before ``deadline_ns``, then wait for it exactly and take what has come."""

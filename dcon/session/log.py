@@ -23,7 +23,7 @@ from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.log_writer import LogWriter
 from pmutools.schema.messages import MESSAGES
-from pmutools.schema.pmu_log import PmuFrame, PmuTopics, config_name, from_message, name_of
+from pmutools.schema.pmu_log import Loggable, PmuFrame, PmuTopics, config_name, from_message, name_of
 
 INI_NAME = "dcon.ini"
 PROBE_NAME = "probing.csv"
@@ -83,7 +83,7 @@ class SessionWriter:
     def tick(
         self,
         record: Record,
-        frames: Iterable[PmuFrame] = (),
+        frames: Iterable[Loggable] = (),
         orders: Iterable[Order] = (),
         *,
         timing: Timing | None = None,

@@ -28,7 +28,7 @@ from pmutools.c37118 import Frame, decode_config
 from pmutools.c37118.checksum import chk
 from pmutools.errors import SourceError, WireError
 from pmutools.flow import StampSource
-from pmutools.schema.pmu_log import PmuFrame, encode_frame
+from pmutools.schema.pmu_log import PmuFrame
 
 Observer = Callable[[float, Record], None]
 """(command_mw as recorded, the record of the tick now)."""
@@ -203,7 +203,7 @@ def _same_bytes(group: TickMessages, now: Tick, instances: Sequence[str], *, fra
         return False
     if not frames:
         return True
-    found = [encode_frame(frame, record.tick_ns) for frame in now.frames]
+    found = [reading.encode(record.tick_ns) for reading in now.readings]
     return found == data.get("PmuFrame", []) and not any(chk(message.wire) for _, message in group.frames)
 
 

@@ -20,7 +20,7 @@ from dcon.session.codec import Pdci, Timing, Watchdog
 from dcon.session.log import SessionWriter
 from dcon.session.parts import SESSION, part_path
 from pmutools.errors import SourceError
-from pmutools.schema.pmu_log import PmuFrame
+from pmutools.schema.pmu_log import Loggable
 from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class RollingWriter:
     def tick(
         self,
         record: Record,
-        frames: Iterable[PmuFrame] = (),
+        frames: Iterable[Loggable] = (),
         orders: Iterable[Order] = (),
         *,
         timing: Timing | None = None,

@@ -196,7 +196,7 @@ def _run(
         if tell is not None and number % TOLD_TICKS == 0:
             tell(outcome.tick_s[-1])
         if log is not None:
-            log.tick(tick.record, tick.frames, orders, pdci=_line(grid, tick_ns))
+            log.tick(tick.record, tick.readings, orders, pdci=_line(grid, tick_ns))
 
 
 def _line(grid: Grid, tick_ns: int) -> Pdci:

@@ -25,7 +25,7 @@ from pmutools.c37118.constants import (
     FrameType,
     command_name,
 )
-from pmutools.c37118.layout import Layout, StationSlots, layout_of
+from pmutools.c37118.layout import Layout, layout_of
 from pmutools.c37118.prefix import Prefix, decode_prefix, encode_prefix, verified
 from pmutools.errors import EncodeError, LengthError, WireError
 
@@ -128,7 +128,7 @@ class Data:
 
     def station(self, station: int = 0) -> StationData:
         values, slots = self.values, self.layout.slots[station]
-        phasors = self._phasors(slots)
+        phasors = self.phasors(station)
         stat, frequency = values[slots.stat], self.frequency(station)
         present = not math.isnan(frequency) or not all(map(cmath.isnan, phasors))
         return StationData(
@@ -141,8 +141,9 @@ class Data:
             values[slots.digitals.start : slots.digitals.stop],  # type: ignore[arg-type]
         )
 
-    def _phasors(self, slots: StationSlots) -> tuple[complex, ...]:
-        """All phasors of a station, at once where they stand in the frame as they are."""
+    def phasors(self, station: int = 0) -> tuple[complex, ...]:
+        """All phasors of a station in V or A RMS, at once where they stand in the frame as they are."""
+        slots = self.layout.slots[station]
         if slots.parts is not None:
             first, second = self.values[slots.parts[0]], self.values[slots.parts[1]]
             if not slots.polar:

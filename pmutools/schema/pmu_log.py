@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from pmutools.c37118 import Data, Frame, FrameType, StreamConfig, decode_config
 from pmutools.errors import WireError
@@ -45,6 +45,22 @@ class PmuFrame(NamedTuple):
     tick_ns: int = 0
     time_base: int = 1_000_000
 
+    def encode(self, tick_ns: int = 0) -> bytes:
+        """The ``PmuFrame`` message; ``tick_ns`` overrides the frame's."""
+        return encode_frame(self, tick_ns)
+
+
+class Loggable(Protocol):
+    """What may be logged as a frame of a PMU: a :class:`PmuFrame`, or something that makes its message quicker."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def time_ns(self) -> int: ...
+    @property
+    def arrival_ns(self) -> int | None: ...
+    def encode(self, tick_ns: int = 0) -> bytes: ...
+
 
 class WireFrame(NamedTuple):
     """Bytes to play back: a data frame, or (told by its SYNC) the configuration of those that follow."""
@@ -74,14 +90,15 @@ class PmuTopics:
             self._described[name] = _describe(config)
         self.log.attach(f"{name}.cfg{kind}", frame, time_ns)
 
-    def write(self, frame: PmuFrame, tick_ns: int = 0) -> None:
+    def write(self, frame: Loggable, tick_ns: int = 0) -> None:
         """Log one frame, at its arrival (or its own time); ``tick_ns`` overrides the frame's."""
         channel = self._channels.get(frame.name)
         if channel is None:
             described = self._described.get(frame.name, {})
             channel = self.log.channel(topic_of(frame.name), "PmuFrame", described)
             self._channels[frame.name] = channel
-        self.log.write(channel, encode_frame(frame, tick_ns), frame.arrival_ns or frame.time_ns, frame.time_ns)
+        time_ns = frame.time_ns
+        self.log.write(channel, frame.encode(tick_ns), frame.arrival_ns or time_ns, time_ns)
 
 
 def encode_frame(frame: PmuFrame, tick_ns: int = 0) -> bytes:
