@@ -153,12 +153,17 @@ def test_a_changed_log_is_told_with_the_first_difference_and_its_inputs(
             f"  {frame.name}: stamp {frame.time_ns}, arrival {frame.arrival_ns}, V1 {abs(frame.v1):.3f} V"
         )
         assert f"{frame.frequency_hz:.6f} Hz" in line
+
+
+def test_the_first_difference_as_json(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    path = rewritten(session, tmp_path / "x.mcap", record_changed(command_mw=1.5))
     code, out, _ = told(capsys, str(path), "--json")
-    assert code == 3
-    first_json = json.loads(out)["first"]
-    assert first_json["tick_ns"] == tick.record.tick_ns and first_json["orders"] == []
-    assert [(f["pmu"], f["time_ns"], f["arrival_ns"]) for f in first_json["frames"]] == [
-        (f.name, f.time_ns, f.arrival_ns) for f in tick.frames
+    tick = list(SessionReader(path).ticks())[EDITED]
+    first = json.loads(out)["first"]
+    assert (code, first["tick_ns"], first["field"], first["recorded"]) == (3, tick.record.tick_ns, "command_mw", 1.5)
+    assert first["orders"] == [] and first["before"].startswith("ACTIVE closed_loop, N1-S1 active")
+    assert [(f["pmu"], f["time_ns"], f["arrival_ns"], f["v1_re"]) for f in first["frames"]] == [
+        (f.name, f.time_ns, f.arrival_ns, f.v1.real) for f in tick.frames
     ]
 
 
