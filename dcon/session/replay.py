@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import pmutools
 from dcon.core.values import Order, Record
 from dcon.engine import Engine, Tick
 from dcon.session import codec
@@ -160,6 +161,9 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
             f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
             f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"
         )
+    version = reader.metadata.get("version", "")
+    if result.different and not changes and version != pmutools.__version__:
+        result.problems.append(f"recorded by version {version or 'unknown'}, replayed by {pmutools.__version__}")
     if not result.stopped and reader.damage:
         result.stopped = "; ".join(reader.damage.lines())
     if not result.ticks and not result.stopped:

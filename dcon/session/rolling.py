@@ -96,8 +96,6 @@ class RollingWriter:
     ) -> None:
         """Log one tick, as :meth:`SessionWriter.tick` does; or count it."""
         now_ns = record.tick_ns
-        if self._log is not None and self._is_due(self._log, now_ns):
-            self._end_part(self._log, now_ns)
         log = self._log or self._next_part(now_ns)
         if log is None:
             self._missing += 1
@@ -118,6 +116,8 @@ class RollingWriter:
             self._begun_ns = now_ns
         self._written += 1
         self._open_ticks += 1
+        if log.size >= self._max_bytes or abs(now_ns - self._begun_ns) >= self._max_ns:
+            self._end_part(log, now_ns)  # the next is begun with the next tick: one piece of work at a time
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """Attach a configuration frame that came at ``time_ns``; parts to come begin with it."""
@@ -131,9 +131,10 @@ class RollingWriter:
 
     def watchdog(self, watchdog: Watchdog) -> None:
         """Log the watchdog's state; where nothing can be logged, it is not."""
-        if self._log is not None:
+        log = self._log or self._next_part(watchdog.time_ns)
+        if log is not None:
             try:
-                self._log.watchdog(watchdog)
+                log.watchdog(watchdog)
             except SourceError as error:
                 self._refused(error, watchdog.time_ns, self._open_ticks)
 
@@ -146,9 +147,6 @@ class RollingWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
-
-    def _is_due(self, log: SessionWriter, now_ns: int) -> bool:
-        return self._written > 0 and (log.size >= self._max_bytes or abs(now_ns - self._begun_ns) >= self._max_ns)
 
     def _end_part(self, log: SessionWriter, now_ns: int) -> None:
         """Close the part, index and all; where there is no room for its index, it stays whole without."""

@@ -89,7 +89,7 @@ def test_a_part_is_whole_in_itself(tmp_path: Path) -> None:
         assert reader.metadata.get("continues") == (log.parts[number - 2].name if number > 1 else None)
         counts.append(len(stamps(reader)))
         assert not reader.damage
-    assert counts == [400, 90, 90, 90, 40]  # 1.5 s each; the first brings the others
+    assert counts == [400, 91, 91, 91, 36]  # 1.5 s each; the first brings the others
 
 
 def test_the_newest_configuration_goes_into_every_part(tmp_path: Path) -> None:
@@ -128,11 +128,11 @@ def test_files_that_do_not_belong_together(tmp_path: Path) -> None:
 def test_a_part_that_is_missing_is_a_loss_where_it_was(tmp_path: Path) -> None:
     log = written(tmp_path / "s.mcap", max_minutes=1 / 40)
     log.parts[1].unlink()
-    assert len(stamps(SessionReader(log.path))) == 90
+    assert len(stamps(SessionReader(log.path))) == 91
     reader = SessionReader([log.path, *log.parts[2:]])
     back = list(reader.ticks())
-    assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 180 * PERIOD_NS]
-    assert len(back) == 310
+    assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 182 * PERIOD_NS]
+    assert len(back) == 309
 
 
 def test_a_cut_part_is_a_loss_at_its_end(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_cut_part_is_a_loss_at_its_end(tmp_path: Path) -> None:
     log.parts[1].write_bytes(log.parts[1].read_bytes()[:-3000])
     reader = SessionReader(log.path)
     back = list(reader.ticks())
-    assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 180 * PERIOD_NS]
+    assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 182 * PERIOD_NS]
     assert reader.damage.cut
     assert export(log.path, tmp_path / "t.csv").gaps == 1
 
@@ -259,10 +259,10 @@ def test_a_replay_needs_the_beginning(session: list[Path], tmp_path: Path, capsy
     said = f"dcon: {session[2]}: part 3 of a session; a replay starts with the first, {session[0].name}\n"
     assert capsys.readouterr().err == said
     assert run(dcon(), ["export", str(session[2]), str(tmp_path / "t.csv"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["rows"] == 120
+    assert json.loads(capsys.readouterr().out)["rows"] == 121
 
 
 def test_a_replay_stops_where_a_part_is_missing(session: list[Path], capsys: Capsys) -> None:
     assert run(dcon(), ["replay", str(session[0]), str(session[3])]) == 3
     out, err = capsys.readouterr()
-    assert out == "120 ticks: identical\n" and "stopped: the log lost something before tick" in err
+    assert out == "121 ticks: identical\n" and "stopped: the log lost something before tick" in err

@@ -155,6 +155,16 @@ def test_a_changed_log_is_told_with_the_first_difference_and_its_inputs(
         assert f"{frame.frequency_hz:.6f} Hz" in line
 
 
+def test_a_difference_to_another_version_is_told(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    path = rewritten(session, tmp_path / "x.mcap", record_changed(command_mw=1.5))
+    monkeypatch.setattr("pmutools.__version__", "99.0")
+    code, _, err = told(capsys, str(path))
+    assert code == 3 and err.startswith("recorded by version 0.") and err.endswith(", replayed by 99.0\n")
+    assert told(capsys, str(session))[0] == 0
+
+
 def test_the_first_difference_as_json(session: Path, tmp_path: Path, capsys: Capsys) -> None:
     path = rewritten(session, tmp_path / "x.mcap", record_changed(command_mw=1.5))
     code, out, _ = told(capsys, str(path), "--json")
