@@ -99,7 +99,7 @@ def outcomes(sweep: Sequence[Run], tell: Tell | None = None) -> Iterator[Outcome
         yield simulate(sweep[0].plan, sweep[0].path, tell)
         return
     before = set(multiprocessing.active_children())
-    workers = ProcessPoolExecutor(min(os.cpu_count() or 1, len(sweep)), initializer=_ended_by_signals)
+    workers = ProcessPoolExecutor(min(os.cpu_count() or 1, len(sweep)), initializer=_led)
     try:
         under_way: list[Future[Outcome]] = [workers.submit(_judged, run) for run in sweep]
         for future in under_way:
@@ -113,9 +113,9 @@ def outcomes(sweep: Sequence[Run], tell: Tell | None = None) -> Iterator[Outcome
             child.terminate()
 
 
-def _ended_by_signals() -> None:
-    """A worker that is interrupted just ends: the process that it works for has the word."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def _led() -> None:
+    """A worker leaves Ctrl-C to the process that it works for, which ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import cmath
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -161,6 +165,32 @@ def test_a_mistake_in_one_run_of_a_sweep_is_one_line(capsys: Capsys) -> None:
     assert run(dcon(), ["simulate", *arguments]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err == "dcon: no plant 'none': one of modal, modal-five\n"
+
+
+@pytest.mark.realtime
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups here")
+def test_ctrl_c_ends_a_sweep_and_its_processes() -> None:
+    """Ctrl-C reaches the whole group; the answer is one exit code and no traceback."""
+    command = [
+        sys.executable,
+        "-m",
+        "dcon.cli",
+        "simulate",
+        "cjb",
+        "--duration",
+        "6",
+        "--sweep",
+        "seed=1:200:1",
+        "--json",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as sweep:
+        assert sweep.stdout is not None
+        assert sweep.stdout.readline() == "[\n" and sweep.stdout.readline().startswith('{"scenario"')
+        os.killpg(sweep.pid, signal.SIGINT)
+        _, said = sweep.communicate(timeout=10)  # to the end of both pipes: every process that had them is gone
+        assert (sweep.returncode, said) == (130, "")
 
 
 def test_the_command_saturates_and_a_gain_beyond_the_operators_is_for_simulation_only(capsys: Capsys) -> None:
