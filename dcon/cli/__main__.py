@@ -2,4 +2,5 @@
 
 from dcon.cli import main
 
-main()
+if __name__ == "__main__":  # a process of a sweep may import this, too
+    main()
