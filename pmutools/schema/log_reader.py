@@ -49,6 +49,7 @@ class LogMetadata(NamedTuple):
 
 
 LogRecord = LogMessage | LogAttachment | LogMetadata
+LogBatch = list[LogMessage] | LogAttachment | LogMetadata
 
 
 @dataclass(slots=True)
@@ -112,12 +113,25 @@ class LogReader:
 
     def records(self, messages: Collection[str] | None = None) -> Iterator[LogRecord]:
         """Everything in file order; ``messages`` names those of our table that are wanted (None: all, foreign too)."""
+        batches = self.batches(messages)
+
+        def each() -> Iterator[LogRecord]:
+            for found in batches:
+                if isinstance(found, list):
+                    yield from found
+                else:
+                    yield found
+
+        return each()
+
+    def batches(self, messages: Collection[str] | None = None) -> Iterator[LogBatch]:
+        """The same, the messages of a chunk at once."""
         self.damage = damage = Damage()
 
-        def walk() -> Iterator[LogRecord]:
+        def walk() -> Iterator[LogBatch]:
             with self._open() as file:
                 size = file.seek(0, os.SEEK_END)
-                yield from _Walk(file, size, damage, messages).records()
+                yield from _Walk(file, size, damage, messages).batches()
 
         return walk()
 
@@ -154,20 +168,19 @@ class _Walk:
         self.found = 0
         self.announced = 0
 
-    def records(self) -> Iterator[LogRecord]:
+    def batches(self) -> Iterator[LogBatch]:
         summary = raw.read_summary(self.file, self.size)
         self.damage.cut = summary is None
         try:
             # the summary repeats every channel: with it, a damaged first chunk takes no other with it
-            for _ in self._walk(summary or b""):
-                pass
+            self._walk(summary or b"", [])
         except DamagedRecordError:
             self.damage.records += 1
         yield from self._data_section()
         if summary is not None:
             self.damage.missing = max(0, self.announced - self.found - self.damage.orphans)
 
-    def _data_section(self) -> Iterator[LogRecord]:
+    def _data_section(self) -> Iterator[LogBatch]:
         at = floor = len(raw.MAGIC)  # floor: nothing before it is looked at again
         while at < self.size:
             record = raw.read_record(self.file, at, self.size)
@@ -192,15 +205,15 @@ class _Walk:
                     floor = record.end
             at = record.end
 
-    def _top_level(self, record: raw.RawRecord) -> Iterator[LogRecord]:
+    def _top_level(self, record: raw.RawRecord) -> Iterator[LogBatch]:
         opcode, body, _ = record
         if opcode == Op.CHUNK:
             self.chunked = True
-            yield from self._walk(raw.unpack_chunk(body))
+            yield from self._messages(raw.unpack_chunk(body))
         elif opcode == Op.MESSAGE and self.chunked:
             raise DamagedRecordError("a message outside the chunks")  # no writer mixes them: a bent message index
         elif opcode in (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE):
-            yield from self._walk(raw.RECORD_HEAD.pack(opcode, len(body)) + body)
+            yield from self._messages(raw.RECORD_HEAD.pack(opcode, len(body)) + body)
         elif opcode == Op.ATTACHMENT:
             attachment = raw.parse_attachment(body)
             yield LogAttachment(attachment.name, attachment.media_type, attachment.log_time, attachment.data)
@@ -212,8 +225,16 @@ class _Walk:
         elif raw.LAST_DEFINED_OPCODE < opcode < raw.FIRST_PRIVATE_OPCODE:
             self.damage.records += 1  # of a later MCAP, or a bent opcode: either way not read
 
-    def _walk(self, data: bytes) -> Iterator[LogMessage]:
-        """Records inside a chunk or the summary."""
+    def _messages(self, data: bytes) -> Iterator[LogBatch]:
+        """Those of a chunk, as far as it holds together."""
+        found: list[LogMessage] = []
+        try:
+            self._walk(data, found)
+        finally:
+            yield found
+
+    def _walk(self, data: bytes, found: list[LogMessage]) -> None:
+        """Records inside a chunk or the summary: messages are added to ``found``."""
         at, end = 0, len(data)
         wanted, channels = self.wanted, self.channels
         unpack, head, message_head = MESSAGE_RECORD.unpack_from, raw.RECORD_HEAD.size, MESSAGE_RECORD.size
@@ -233,7 +254,7 @@ class _Walk:
                 else:
                     self.found += 1
                     if wanted is None or channel.message in wanted:
-                        yield LogMessage(channel, log_time_ns, publish_time_ns, data[at + message_head : stop])
+                        found.append(LogMessage(channel, log_time_ns, publish_time_ns, data[at + message_head : stop]))
             else:
                 opcode, length = raw.RECORD_HEAD.unpack_from(data, at)
                 stop = at + head + length
