@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dcon.sim.faults import fault
+from dcon.sim.probing import Split, split_probing
 from pmutools import timebase
 from pmutools.grid.pmu_model import PmuModel
 from pmutools.grid.scenarios import Scenario, scenario
@@ -29,7 +30,7 @@ class Plan:
     profile: Profile = field(default_factory=Profile)
     """More of them, on top."""
     control: bool = True
-    """False: the controller computes and logs, and drives nothing."""
+    """False: the controller computes and logs, and drives nothing but a probing signal of the scenario."""
     align: bool = True
     interpolate_single_loss: bool = False
     duration_s: float | None = None
@@ -40,6 +41,11 @@ class Plan:
     @property
     def course(self) -> Scenario:
         return scenario(self.scenario)
+
+    @property
+    def split(self) -> Split:
+        """The scenario, its probing signal apart: that is the controller's to drive."""
+        return split_probing(self.course, open_loop=not self.control)
 
     @property
     def length_s(self) -> float:

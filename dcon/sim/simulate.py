@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dcon.core.rows import CORE
-from dcon.core.values import Event, Record
+from dcon.core.values import Event, Mode, Pdci, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
 from dcon.session.codec import Pdci
@@ -31,6 +31,7 @@ from pmutools.grid.emulate import EmulatedStream
 from pmutools.grid.grid import Grid
 from pmutools.grid.plant import build
 from pmutools.grid.pmu_model import PmuModel, fleet, measure
+from pmutools.grid.scenarios import Scenario
 from pmutools.grid.signals import Bus
 from pmutools.impair.outgoing import Fate
 from pmutools.impair.pipeline import Pipeline
@@ -105,6 +106,7 @@ def settings_of(plan: Plan, pmus: Sequence[PmuModel]) -> Settings:
         rate_hz=plan.rate_hz,
         align=plan.align,
         interpolate_single_loss=plan.interpolate_single_loss,
+        extra="\n" + plan.split.section,
     )
     return parse(text, f"simulation of {plan.scenario}")
 
@@ -172,8 +174,11 @@ def _run(
     log: SessionWriter | None,
     tell: Tell | None,
 ) -> None:
-    grid = _grid(plan, delays.command_ns)
-    operator = EagerOperator()
+    grid = _grid(plan, plan.split.plant, delays.command_ns)
+    split = plan.split
+    probe_s = split.start_s if split.section else None
+    operator = EagerOperator(Mode.CLOSED_LOOP if plan.control else Mode.OPEN_LOOP, probe_s)
+    operated = plan.control or probe_s is not None
     arrivals: list[tuple[int, int, str, bytes]] = []
     order = 0
     end_ns = START_NS + round(plan.length_s * timebase.NS)
@@ -189,7 +194,7 @@ def _run(
         while arrivals and arrivals[0][0] <= tick_ns:
             arrival_ns, _, name, data = heapq.heappop(arrivals)
             frames.setdefault(name, []).append(Frame(data, arrival_ns, StampSource.CAPTURE, 0))
-        orders = operator.orders(engine.state.system) if plan.control else ()
+        orders = operator.orders(engine.state.system, (tick_ns - START_NS) / timebase.NS) if operated else ()
         tick = engine.tick(frames, orders, tick_ns)
         grid.command(tick.record.output_v * MW_PER_V, tick_ns)
         _note(outcome, tick.record)
@@ -204,9 +209,9 @@ def _line(grid: Grid, tick_ns: int) -> Pdci:
     return Pdci(tick_ns, SCHEDULE_MW + grid.drive.modulation_mw)
 
 
-def _grid(plan: Plan, command_ns: int) -> Grid:
-    plant = build(plan.plant, plan.course.condition)
-    return Grid(plant, plan.course, start_ns=START_NS, command_delay_ns=command_ns, seed=plan.seed)
+def _grid(plan: Plan, course: Scenario, command_ns: int) -> Grid:
+    plant = build(plan.plant, course.condition)
+    return Grid(plant, course, start_ns=START_NS, command_delay_ns=command_ns, seed=plan.seed)
 
 
 def _stamps(plan: Plan) -> Iterator[int]:
@@ -252,7 +257,7 @@ def _note(outcome: Outcome, record: Record) -> None:
 
 def _uncontrolled(plan: Plan) -> list[float]:
     """The same grid left alone: its swing in mHz at the plan's rate."""
-    grid = _grid(plan, 0)
+    grid = _grid(plan, plan.course, 0)
     swing = []
     stamps = _stamps(plan)
     for _ in range(round(plan.length_s * plan.rate_hz)):

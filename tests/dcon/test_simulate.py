@@ -12,19 +12,20 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dcon.cli import dcon
 from dcon.core.differentiator import PAPER_60, response
+from dcon.limiter import MW_PER_V
 from dcon.session.columns import read_columns
+from dcon.session.replay import replay
 from dcon.sim.delays import split
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import SCHEDULE_MW, simulate
 from pmutools.cli.shell import run
 from pmutools.grid.modal import SEPARATED_FROM_ALBERTA
-from pmutools.grid.scenarios import scenario
 from pmutools.grid.theory import closed_loop_eigenvalue, frequency_and_damping
-from pmutools.timebase import NS
 
 Capsys = pytest.CaptureFixture[str]
 KEYS = (
@@ -220,19 +221,27 @@ def test_bc_alberta_separation_leaves_one_slower_mode_that_is_damped() -> None:
     assert outcome.mode.damping_percent > 10
 
 
-def test_probing_reaches_the_line_and_is_told_from_the_command(tmp_path: Path) -> None:
-    outcome = simulate(Plan("probing", gain_mw_per_mhz=12, duration_s=25), str(tmp_path / "s.mcap"))
-    session = read_columns(tmp_path / "s.mcap")
-    signal = scenario("probing").multisine
-    assert signal is not None and outcome.final_state == "ACTIVE"
-    line_mw = session.tick.pdci_mw - SCHEDULE_MW
-    assert set(line_mw[:200]) == {0.0}
-    for k in range(600, 1500, 37):
-        # at tick k the line follows the command of the tick before, 11 ms later, and the signal at the newest stamp
-        stamp_ns = round((k + 4) * NS / 60)
-        signal_mw = signal.mw(stamp_ns * 60 // NS / 60)
-        assert line_mw[k] == pytest.approx(session.tick.command_mw[k - 1] + signal_mw, abs=1e-9)
+@pytest.mark.parametrize("control", [True, False])
+def test_probing_reaches_the_line_and_is_logged_apart_from_the_command(tmp_path: Path, control: bool) -> None:
+    plan = Plan("probing", gain_mw_per_mhz=12, duration_s=25, control=control)
+    outcome = simulate(plan, str(tmp_path / "s.mcap"))
+    tick = read_columns(tmp_path / "s.mcap").tick
+    assert outcome.final_state == "ACTIVE"
+    assert not tick.probe_mw[:300].any() and 15 < abs(tick.probe_mw).max() <= 20
+    driven_mw = tick.probe_mw + (tick.command_mw if control else 0)
+    assert np.allclose(tick.output_v * MW_PER_V, driven_mw, atol=1e-9)
+    # the line follows what was driven in the tick before
+    assert np.allclose(tick.pdci_mw[1:] - SCHEDULE_MW, driven_mw[:-1], atol=1e-9)
     assert 1 < max(map(abs, outcome.command_mw)) < 20
+    assert replay(tmp_path / "s.mcap").different == 0
+
+
+def test_a_square_pulse_is_driven_by_the_controller_and_rings_the_mode(tmp_path: Path) -> None:
+    outcome = simulate(Plan("square-pulse", gain_mw_per_mhz=0, duration_s=26), str(tmp_path / "s.mcap"))
+    tick = read_columns(tmp_path / "s.mcap").tick
+    assert (tick.probe_mw.max(), tick.probe_mw.min()) == (125, -125)
+    assert not tick.probe_mw[(13 * 60) :].any()
+    assert outcome.mode is not None and outcome.mode[:2] == pytest.approx((0.425, 7.8), abs=0.02)
 
 
 def test_five_modes_keep_table_2() -> None:
