@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dcon.core.values import InstanceState, Mode, SystemState
+from dcon.core.values import Flag, InstanceState, Mode, SystemState
 from dcon.session.codec import Watchdog
 from pmutools.flow import StampSource
 from pmutools.schema.log_reader import Damage
@@ -101,6 +101,15 @@ class OrderRow(NamedTuple):
     tick_ns: int
     name: str
     value: float
+    text: str
+    who: str
+
+
+class FlagRow(NamedTuple):
+    """An entry of the flag register that changed in a tick, as it was then."""
+
+    tick_ns: int
+    flag: Flag
 
 
 @dataclass(frozen=True)
@@ -120,6 +129,7 @@ class SessionColumns:
     """By name: each that the log has frames of."""
     events: list[EventRow]
     orders: list[OrderRow]
+    flag_changes: list[FlagRow]
     watchdog: list[Watchdog]
     gaps: list[int]
     """Rows of ``tick`` before which the log has lost something; 0 for its beginning, T for its end."""

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from dcon.session.codec import Watchdog
+from dcon.session.codec import Watchdog, decode_flag, decode_order
 from dcon.session.column_tables import (
     INSTANCE_STATES,
     MODES,
@@ -30,6 +30,7 @@ from dcon.session.column_tables import (
     Array,
     Codes,
     EventRow,
+    FlagRow,
     Floats,
     InstanceColumns,
     Ints,
@@ -53,6 +54,7 @@ __all__ = [
     "TABLES",
     "UNKNOWN",
     "EventRow",
+    "FlagRow",
     "InstanceColumns",
     "OrderRow",
     "PmuColumns",
@@ -68,7 +70,7 @@ _ALWAYS = frozenset(("Tick", "Timing", "Pdci"))
 _MESSAGES: Final = {
     "instance": frozenset(("Instance",)),
     "pmu": frozenset(("PmuFrame",)),
-    "event": frozenset(("Event", "Setting", "Watchdog")),
+    "event": frozenset(("Event", "Setting", "Flag", "Watchdog")),
 }
 TABLES: Final = tuple(_MESSAGES)
 """What may be left out."""
@@ -77,7 +79,8 @@ TABLES: Final = tuple(_MESSAGES)
 def read_columns(paths: Paths, tables: Collection[str] = TABLES) -> SessionColumns:
     """Read a session log: one file, the first part with those that follow it, or parts as named.
 
-    ``tables``: which of :data:`TABLES` to read beside ``tick``; ``event`` is events, orders and watchdog. Raises
+    ``tables``: which of :data:`TABLES` to read beside ``tick``; ``event`` is events, orders, changes
+    of flags, and watchdog. Raises
     SourceError for what is no session log, as :class:`~dcon.session.log.SessionReader` does.
     """
     reader = SessionReader(paths)
@@ -150,6 +153,7 @@ class _Builder:
         self._incomplete = 0
         self._events: list[EventRow] = []
         self._orders: list[OrderRow] = []
+        self._flags: list[FlagRow] = []
         self._watchdog: list[Watchdog] = []
         self._take_instances(self._take_ticks({}), [])  # so that every column is there
 
@@ -169,7 +173,9 @@ class _Builder:
             elif kind == "Event":
                 self._events += [EventRow(m.tick_ns, m.name, m.subject, m.detail) for m in self._each(kind, messages)]
             elif kind == "Setting":
-                self._orders += [OrderRow(m.tick_ns, m.name, m.value) for m in self._each(kind, messages)]
+                self._orders += [OrderRow(m.tick_ns, *decode_order(m)) for m in self._each(kind, messages)]
+            elif kind == "Flag":
+                self._flags += [FlagRow(m.tick_ns, decode_flag(m)) for m in self._each(kind, messages)]
             elif kind == "Watchdog":
                 self._watchdog += [_watchdog(message) for message in self._each(kind, messages)]
         self._ticks += len(tick_ns)
@@ -255,6 +261,7 @@ class _Builder:
             pmu={name: PmuColumns(**blocks.whole()) for name, blocks in self._pmu.items()},
             events=self._events,
             orders=self._orders,
+            flag_changes=self._flags,
             watchdog=self._watchdog,
             gaps=self._gaps,
             incomplete_ticks=self._incomplete,

@@ -227,6 +227,8 @@ def _cell(value: Any, field: Field) -> int | float | str | bool | None:
         return json.dumps([_cell(each, field._replace(repeated=False)) for each in value], ensure_ascii=False)
     if field.type == "bytes":
         return str(value.hex())
+    if value == "":
+        return None
     known: int | float | str | bool | None = _known(value) if isinstance(value, float) else value
     return known
 

@@ -117,8 +117,7 @@ class LogWriter:
         chunk, self._chunk = self._chunk, OpenChunk()
         record, index = self._summary.chunk(self.size, chunk)
         with self._writing():
-            self._put(record)
-            self._put(index)
+            self._put(record + index)  # both or neither: what is counted as lost is not in the file
 
     def _put(self, record: bytes) -> None:
         """Write all of ``record``, or leave the file as it was."""

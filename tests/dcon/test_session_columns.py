@@ -74,6 +74,9 @@ def compare(paths: Paths) -> tuple[SessionColumns, list[LoggedTick]]:
     assert [bits(tuple(order)) for order in session.orders] == [
         bits((logged.record.tick_ns, *order)) for logged in ticks for order in logged.orders
     ]
+    assert [bits((at, *flag)) for at, flag in session.flag_changes] == [
+        bits((logged.record.tick_ns, *flag)) for logged in ticks for flag in logged.record.flag_changes
+    ]
     losses = [row for row, logged in enumerate(ticks) if logged.after_loss]
     assert [row for row in session.gaps if row < len(ticks)] == losses
     return session, ticks

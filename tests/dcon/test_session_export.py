@@ -54,6 +54,11 @@ def none_if_nan(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
 
 
+def cell(value: Any) -> Any:
+    """As a table has it: what is not known, or not said, is null."""
+    return none_if_nan(value) if isinstance(value, float) else None if value == "" else value
+
+
 def expected_tick(tick: Tick) -> dict[str, Any]:
     record = tick.record
     return {
@@ -186,11 +191,7 @@ def test_event_rows(session: Path, tmp_path: Path) -> None:
 
 def test_flag_rows_are_the_changes_of_the_register(session: Path, tmp_path: Path) -> None:
     export(session, tmp_path / "f.parquet", "flag")
-    expected = [
-        (tick.record.tick_ns, *(none_if_nan(v) if isinstance(v, float) else v for v in flag))
-        for tick in TICKS
-        for flag in tick.record.flag_changes
-    ]
+    expected = [(tick.record.tick_ns, *map(cell, flag)) for tick in TICKS for flag in tick.record.flag_changes]
     rows = pq.read_table(tmp_path / "f.parquet").to_pylist()
     assert expected
     assert bits(tuple(tuple(row.values()) for row in rows)) == bits(tuple(expected))
@@ -202,15 +203,11 @@ def test_flag_rows_are_the_changes_of_the_register(session: Path, tmp_path: Path
 
 def test_messages_as_they_are(session: Path, tmp_path: Path) -> None:
     for table, values in (
-        ("setting", [(t.record.tick_ns, o.name, none_if_nan(o.value)) for t in TICKS for o in t.orders]),
+        ("setting", [(t.record.tick_ns, *map(cell, o)) for t in TICKS for o in t.orders]),
         ("timing", [(t.record.tick_ns, *map(none_if_nan, t.timing)) for t in TICKS if t.timing]),
         (
             "pdci",
-            [
-                (t.record.tick_ns, p.time_ns, none_if_nan(p.power_mw), p.in_service, p.dcon_enabled)
-                for t in TICKS
-                if (p := t.pdci)
-            ],
+            [(t.record.tick_ns, *map(cell, p)) for t in TICKS if (p := t.pdci or t.surroundings.pdci)],
         ),
     ):
         out = tmp_path / f"{table}.parquet"
@@ -242,7 +239,7 @@ def test_the_watchdogs_table(tmp_path: Path) -> None:
 
 def test_every_topic_has_its_table() -> None:
     topics = {message.topic.rpartition("/")[2] for message in MESSAGES.values()} - {"frame"}
-    assert set(TABLES) == topics | {"pmu", "flag"}
+    assert set(TABLES) == topics | {"pmu"}
 
 
 def test_a_damaged_log_exports_every_table(session: Path, tmp_path: Path) -> None:
@@ -269,7 +266,7 @@ def test_gaps_are_counted(session: Path, tmp_path: Path) -> None:
 
 def test_mistakes_are_one_line_and_write_nothing(session: Path, tmp_path: Path) -> None:
     out = tmp_path / "t.parquet"
-    with pytest.raises(SettingsError, match="no table 'ticks'; there are tick, instance, pmu, event, flag, setting"):
+    with pytest.raises(SettingsError, match="no table 'ticks'; there are tick, instance, pmu, event, setting"):
         export(session, out, "ticks")
     with pytest.raises(SettingsError, match=r"t\.xlsx: unknown suffix '\.xlsx'; use one of \.csv, "):
         export(session, tmp_path / "t.xlsx")
