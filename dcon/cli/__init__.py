@@ -11,6 +11,7 @@ COMMANDS = {
     "simulate": ("dcon.cli.simulate", "A scenario in virtual time, through the same bytes and the same engine."),
     "replay": ("dcon.cli.replay", "A recorded session through the engine again; commands must be identical."),
     "export": ("dcon.cli.export", "A session log as a table."),
+    "analyze": ("dcon.cli.analyze", "What recorded sessions tell: a report, figures, and JSON."),
     "check": ("dcon.cli.check", "Dry check of an initialisation file; prints every effective setting."),
     "platform": ("dcon.cli.platform", "The real-time controller: PMU streams in, command out, session log."),
 }

@@ -95,9 +95,9 @@ def require_extra() -> None:
             ) from None
 
 
-def render(template: str, figures: Sequence[Figure], told: Mapping[str, Any]) -> str:
-    """The page: ``template`` of this package, which extends ``page.html``, with ``told`` for its names."""
-    environment = _environment()
+def render(template: str, figures: Sequence[Figure], told: Mapping[str, Any], package: str = "pmutools.report") -> str:
+    """The page: ``template`` of ``package``, which extends ``page.html`` of this one, with ``told`` for its names."""
+    environment = _environment(package)
     scripts = [_asset("page.js"), _plotly()]
     hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts]
     policy = (
@@ -139,11 +139,11 @@ def _embedded_figure(figure: Figure) -> Markup:
 
 
 @cache
-def _environment() -> Environment:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+def _environment(package: str) -> Environment:
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("pmutools.report"),
+        loader=ChoiceLoader([PackageLoader(name) for name in dict.fromkeys((package, "pmutools.report"))]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
