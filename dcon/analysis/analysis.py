@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from dcon.analysis.disturbances import Floats, noise_of
 from dcon.analysis.ringdowns import Comparison, Loop, Ringdown, compare, ringdowns
 from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
-from dcon.session.column_tables import InstanceColumns, SessionColumns, TickColumns
+from dcon.session.column_tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
 from dcon.session.columns import read_columns
 from dcon.session.parts import part_of
 from dcon.settings import parse
@@ -25,6 +26,8 @@ from pmutools.measure.budget import Row
 from pmutools.timebase import NS
 
 Tell = Callable[[str], None]
+DRIVING = ("ACTIVE", "RAMPDOWN")
+CLOSED = "closed_loop"
 MOST_EVENTS = 2000
 """Events, switches and orders that JSON and page list; counts are of all."""
 
@@ -117,14 +120,8 @@ class Outcome:
 
     @property
     def between(self) -> list[course.Gap]:
-        """The times between one session and the next."""
-        pairs = zip(self.sessions[:-1], self.sessions[1:], strict=True)
-        return [
-            course.Gap(
-                a.end_ns, b.begin_ns, max(0, round((b.begin_ns - a.end_ns) / NS * b.rate_hz)), "between sessions"
-            )
-            for a, b in pairs
-        ]
+        """The times between one session and the next; of none, where they overlap."""
+        return [_between(a, b) for a, b in itertools.pairwise(self.sessions)]
 
     @property
     def comparison(self) -> list[Comparison]:
@@ -144,6 +141,13 @@ class Outcome:
             "comparison": [row.to_json() for row in self.comparison],
             "unread": [{"file": name, "why": why} for name, why in self.unread],
         }
+
+
+def _between(a: Analysis, b: Analysis) -> course.Gap:
+    if b.begin_ns < a.end_ns:
+        return course.Gap(b.begin_ns, b.begin_ns, 0, "the sessions overlap")
+    missing = max(0, round((b.begin_ns - a.end_ns) / NS * b.rate_hz))
+    return course.Gap(a.end_ns, b.begin_ns, missing, "between sessions")
 
 
 Look = Callable[[Analysis], None]
@@ -244,7 +248,8 @@ def analyze(paths: Sequence[str | os.PathLike[str]]) -> Analysis:
 def loop_of(session: SessionColumns, rate_hz: float, limit_mw: float) -> Loop:
     """What ringdowns are found in: Δf of the active instance, and without one the median of those that run."""
     tick = session.tick
-    situation = tick.state.astype(np.int64) * 256 + tick.mode
+    driving = np.isin(tick.state, [STATES.index(state) for state in DRIVING]) & (tick.mode == MODES.index(CLOSED))
+    situation = np.where(driving, tick.state.astype(np.int64) + 1, 0)
     return Loop(
         tick.tick_ns,
         delta_f_of(session),

@@ -120,9 +120,9 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
     ]
     for name, found in _by_name(session.modes).items():
         marks.append(_bar(name, found, 1, theme.GREEN if name == "closed_loop" else theme.MUTED, listed=False))
-    for place, (name, found) in enumerate(_by_name(session.actives).items()):
-        if name:
-            marks.append(_bar(name, found, 2, theme.CYCLE[place % len(theme.CYCLE)], listed=False))
+    by_instance = {name: found for name, found in _by_name(session.actives).items() if name}
+    for place, (name, found) in enumerate(by_instance.items()):
+        marks.append(_bar(name, found, 2, theme.CYCLE[place % len(theme.CYCLE)], listed=False))
     for name, found in sorted(session.flags.items(), key=lambda item: item[1][0].begin_ns)[:MOST_FLAGS]:
         marks.append(_bar(name, found, len(names), theme.VERMILION, listed=False))
         names.append(name)
@@ -181,13 +181,12 @@ def thinned(x: Floats, y: Floats, most: int = MOST_POINTS) -> tuple[Floats, Floa
     if len(x) <= most:
         return x, y
     size = math.ceil(2 * len(x) / most)
-    whole = len(x) // size * size
-    blocks = y[:whole].reshape(-1, size)
+    blocks = np.append(y, np.full(-len(y) % size, np.nan)).reshape(-1, size)
     known = np.isfinite(blocks)
     low = np.where(known, blocks, np.inf).argmin(axis=1)
     high = np.where(known, blocks, -np.inf).argmax(axis=1)
     at = np.stack((np.minimum(low, high), np.maximum(low, high)), 1) + np.arange(len(blocks))[:, np.newaxis] * size
-    rows = np.concatenate((at.ravel(), np.arange(whole, len(x))))
+    rows = np.minimum(at.ravel(), len(x) - 1)
     return x[rows], y[rows]
 
 
@@ -212,7 +211,12 @@ def _signals(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fig
     if np.nan_to_num(tick.probe_mw).any():
         command.append(_line(session, "probing signal", tick.probe_mw, theme.PURPLE))
     command += [
-        Rule(f"limit, ±{session.limit_mw:g} MW", side * session.limit_mw, theme.VERMILION, upright=False)
+        Rule(
+            f"limit, {'−' if side < 0 else ''}{session.limit_mw:g} MW",
+            side * session.limit_mw,
+            theme.VERMILION,
+            upright=False,
+        )
         for side in (1, -1)[: 2 if np.abs(tick.command_mw).max() > session.limit_mw / 2 else 0]
     ]
     count = tick.f_hz.shape[1]

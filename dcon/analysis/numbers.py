@@ -174,4 +174,4 @@ def delay_budget(session: SessionColumns) -> tuple[Row, ...]:
         return (
             budget(delay, above, wait, compute_ms=0.0) if SIMULATED in session.metadata else budget(delay, above, wait)
         )
-    return budget(delay, above, wait, compute_ms=float(compute.mean()) / 1e3)
+    return budget(delay, above, wait, compute_ms=round(float(compute.mean()) / 1e3, 3))

@@ -81,7 +81,7 @@ def told(outcome: Outcome, ordered: Sequence[tuple[Analysis, list[Figure]]]) -> 
         "comparison": tables.comparison_table(outcome.comparison, "open-closed"),
         "sections": [section(session, figures, at) for at, (session, figures) in enumerate(ordered, 1)],
         "provenance": [("Made by", f"pmutools {pmutools.__version__}")],
-        "source": listed([Path(name).name for session in outcome.sessions for name in session.files]),
+        "source": listed([_title(session) for session in outcome.sessions]),
     }
 
 
@@ -101,7 +101,7 @@ def section(session: Analysis, figures: Sequence[Figure], number: int) -> Sectio
     }
     return Section(
         stem,
-        ", ".join(Path(name).name for name in session.files),
+        _title(session),
         session,
         _facts(session),
         [name for name in names if name.endswith(("-timeline", "-signals"))],
@@ -112,6 +112,11 @@ def section(session: Analysis, figures: Sequence[Figure], number: int) -> Sectio
         tables.timing_facts(session),
         tables.command_facts(session),
     )
+
+
+def _title(session: Analysis) -> str:
+    """Names of its files, with the folder: every session of a simulation is called the same."""
+    return ", ".join("/".join(Path(name).parts[-2:]) for name in session.files)
 
 
 def _facts(session: Analysis) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dcon.analysis.disturbances import Floats, disturbances
+from dcon.analysis.disturbances import REST_S, Floats, disturbances
 from pmutools.modal.matrix_pencil import ringdown
 
 ORDERS: Final = tuple(range(8, 21, 2))
@@ -45,7 +45,7 @@ class Loop(NamedTuple):
     probe_mw: Floats
     gain_mw_per_mhz: Floats
     situation: npt.NDArray[np.int64]
-    """Changes where state, mode or what else makes one loop another changes."""
+    """0 in open loop; changes where one loop becomes another."""
     rate_hz: float
     limit_mw: float
 
@@ -101,9 +101,19 @@ class Ringdown(NamedTuple):
 
 def ringdowns(loop: Loop, breaks: Sequence[int] = ()) -> list[Ringdown]:
     """Every ringdown of a session; ``breaks`` are rows before which something is missing."""
-    starts = disturbances(loop.delta_f_mhz, loop.rate_hz)
+    starts = _starts(loop)
     ends = [*starts[1:], len(loop.tick_ns)]
     return [_ringdown(loop, start, end, breaks) for start, end in zip(starts[:MOST], ends, strict=False)]
+
+
+def _starts(loop: Loop) -> list[int]:
+    """Rows at which something begins to move the grid: disturbances, and probing signals, however small."""
+    probing = np.diff((loop.probe_mw != 0).astype(np.int8), prepend=0) > 0
+    found: list[int] = []
+    for row in sorted((*disturbances(loop.delta_f_mhz, loop.rate_hz), *np.flatnonzero(probing).tolist())):
+        if not found or row >= found[-1] + round(REST_S * loop.rate_hz):
+            found.append(row)
+    return found
 
 
 def _ringdown(loop: Loop, start: int, end: int, breaks: Sequence[int]) -> Ringdown:
@@ -123,6 +133,8 @@ def _ringdown(loop: Loop, start: int, end: int, breaks: Sequence[int]) -> Ringdo
     end = max(begin, min(end, begin + _same(loop, begin, end)))
     closed = bool((loop.output_v[begin:end] != 0).any())
     found, why = _fit(loop, begin, end)
+    if probing.any() and loop.probe_mw[begin] != 0:
+        why = f"a probing signal was still on {SEARCH_S:g} s later"
     return Ringdown(
         disturbed_ns=int(loop.tick_ns[start]),
         begin_ns=int(loop.tick_ns[begin]),
