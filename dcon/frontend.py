@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -28,6 +31,8 @@ class Binding:
     station: int
     voltage: tuple[int, ...]
     """Columns of V1, or of VA, VB and VC."""
+    places: tuple[int, ...]
+    """Of their magnitudes among a frame's values, where all are polar floats as they stand; else empty."""
     encoder: FrameEncoder = field(compare=False)
 
     def read(self, frame: Frame) -> Reading | None:
@@ -93,23 +98,8 @@ class Reading(NamedTuple):
 
     def entry(self) -> PmuFrame:
         """The frame as a log entry."""
-        binding, frame, data, sample = self
-        if phasors := _polar(data, binding.whole):
-            return PmuFrame(
-                binding.name,
-                bytes(frame.data),
-                sample.time_ns,
-                frame.arrival_ns,
-                frame.stamp_source,
-                sample.stat,
-                sample.time_quality,
-                sample.frequency_hz,
-                data.rocof(),
-                sample.v1,
-                tuple(phasors),
-                time_base=sample.time_base,
-            )
-        return pmu_frame(binding.name, frame, data, station=binding.station, v1=sample.v1)
+        name, station = self.binding.name, self.binding.station
+        return pmu_frame(name, self.frame, self.data, station=station, v1=self.sample.v1)
 
 
 def _polar(data: Data, places: Sequence[int]) -> list[complex]:
@@ -174,7 +164,16 @@ def bind(
             raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
         columns.append(first + channels.index(wanted))
     layout = layout_of(config)
-    return Binding(name, config, layout, index, tuple(columns), FrameEncoder(name, layout, index))
+    encoder = FrameEncoder(name, layout, index)
+    return Binding(name, config, layout, index, tuple(columns), _places(layout, columns), encoder)
+
+
+def _places(layout: Layout, columns: Iterable[int]) -> tuple[int, ...]:
+    """Where the phasors' magnitudes are, if all are polar floats that mean what they say."""
+    slots = [layout.phasors[column] for column in columns]
+    if all(slot.polar and slot.floating and slot.factor == 1 and not slot.angle_offset_rad for slot in slots):
+        return tuple(slot.first for slot in slots)
+    return ()
 
 
 def _station(name: str, config: StreamConfig, station: str | None) -> int:

@@ -137,6 +137,7 @@ class Platform:
                 pmus=[site.name for site in settings.sites],
                 instances=settings.params.instance_names,
                 flags=CORE.names,
+                probe_file=settings.probe_file,
                 max_mb=settings.log.max_mb,
                 max_minutes=settings.log.max_minutes,
             ) as writer:
@@ -214,7 +215,7 @@ class Platform:
         configs, self._configs = self._configs, []
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
-        log.tick(tick.record, tick.readings, orders, timing=timing)
+        log.tick(tick.record, tick.readings, orders, timing=timing, surroundings=tick.surroundings)
 
     def _receive_until(self, deadline_ns: int) -> None:
         """Receive and parse until shortly before ``deadline_ns``, then wait for it exactly and take what has come."""

@@ -17,7 +17,7 @@ from typing import IO, Any, NamedTuple
 import pmutools
 from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surroundings
 from dcon.session import codec
-from dcon.session.codec import Pdci, Timing, Watchdog
+from dcon.session.codec import Timing, Watchdog
 from dcon.session.parts import SESSION, Part, Paths, is_apart, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
@@ -190,9 +190,10 @@ class TickMessages:
 class SessionReader:
     """A session log. What precedes the first tick is read at once.
 
-    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``configs`` (first frame of
-    each PMU): those of the first part. ``incomplete_ticks`` and ``damage`` are those of the last iteration, once it is
-    exhausted. Which parts are read for ``paths``: :func:`~dcon.session.parts.parts_of`.
+    ``metadata`` (text by key), ``pmus``, ``instances``, ``flags`` (names), ``ini_text``, ``probe_file`` (None where
+    there is none), ``configs`` (first frame of each PMU): those of the first part. ``incomplete_ticks`` and ``damage``
+    are those of the last iteration, once it is exhausted. Which parts are read for ``paths``:
+    :func:`~dcon.session.parts.parts_of`.
     Raises SourceError for a file that cannot be read, is no session log, or not of the same session.
     """
 
@@ -297,7 +298,9 @@ class SessionReader:
 
 _TIMES = {name: "tick_ns" if name == "PmuFrame" else message.fields[0].name for name, message in MESSAGES.items()}
 """Field of each message that names its tick; of one that belongs to none, its time."""
-TICK_MESSAGES = frozenset(("PmuFrame", "Setting", "Tick", "Instance", "Event", "Timing", "Pdci"))
+TICK_MESSAGES = frozenset(
+    ("PmuFrame", "Setting", "Surroundings", "Tick", "Instance", "Event", "Flag", "Timing", "Pdci")
+)
 """What a :class:`LoggedTick` is made of."""
 
 

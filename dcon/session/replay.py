@@ -130,7 +130,7 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
         )
     if not reader.ini_text:
         raise SourceError(f"{reader.path}: the log holds no initialisation file (its beginning is lost), so no replay")
-    settings = parse(reader.ini_text, f"{reader.path}: {_INI}", tuple(changes))
+    settings = parse(reader.ini_text, f"{reader.path}: {_INI}", tuple(changes), probe_file=reader.probe_file)
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
     result = Replay(changes=tuple(changes))
     before = "the session begins"
@@ -189,8 +189,8 @@ def _again(engine: Engine, group: TickMessages, result: Replay) -> Tick:
     for name, message in group.frames:
         source = _STAMP_SOURCES.get(message.stamp_source, StampSource.CAPTURE)
         frames.setdefault(name, []).append(Frame(message.wire, message.arrival_ns or None, source, 0))
-    orders = tuple(Order(order.name, order.value) for order in group.messages.get("Setting", ()))
-    return engine.tick(frames, orders, group.tick_ns)
+    orders = tuple(map(codec.decode_order, group.messages.get("Setting", ())))
+    return engine.tick(frames, orders, group.tick_ns, codec.decode_surroundings(group.one("Surroundings")))
 
 
 def _same_bytes(group: TickMessages, now: Tick, instances: Sequence[str], *, frames: bool) -> bool:
@@ -204,6 +204,8 @@ def _same_bytes(group: TickMessages, now: Tick, instances: Sequence[str], *, fra
         if event.subject != LOG_SUBJECT
     ]
     if [codec.encode_event(record.tick_ns, event) for event in record.events] != logged:
+        return False
+    if [codec.encode_flag(record.tick_ns, flag) for flag in record.flag_changes] != data.get("Flag", []):
         return False
     if not frames:
         return True

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from dcon.core.values import Event, Order, Record
-from dcon.session.codec import Pdci, Timing, Watchdog
+from dcon.core.values import NOTHING, Event, Order, Pdci, Record, Surroundings
+from dcon.session.codec import Timing, Watchdog
 from dcon.session.log import SessionWriter
 from dcon.session.parts import SESSION, part_path
 from pmutools.errors import SourceError
@@ -44,7 +44,7 @@ class RollingWriter:
         two ticks; infinity for no limit.
     session_id
         What the parts have in common; unless given, one that no other session has.
-    ini_text, configs, metadata, pmus, instances, flags
+    ini_text, configs, metadata, pmus, instances, flags, probe_file
         As for :class:`SessionWriter`; they go into every part, with the newest configurations.
     """
 
@@ -58,6 +58,7 @@ class RollingWriter:
         pmus: Sequence[str],
         instances: Sequence[str],
         flags: Sequence[str] = (),
+        probe_file: bytes = b"",
         max_mb: float = float("inf"),
         max_minutes: float = float("inf"),
         session_id: str | None = None,
@@ -70,6 +71,7 @@ class RollingWriter:
         self._max_bytes = max_mb * 1e6
         self._max_ns = max_minutes * 60 * NS
         self._ini_text = ini_text
+        self._probe_file = probe_file
         self._configs = {name: (frame, 0) for name, frame in configs.items()}
         self._metadata = {**metadata, SESSION: session_id or uuid.uuid4().hex}
         self._names = {"pmus": tuple(pmus), "instances": tuple(instances), "flags": tuple(flags)}
@@ -93,6 +95,7 @@ class RollingWriter:
         *,
         timing: Timing | None = None,
         pdci: Pdci | None = None,
+        surroundings: Surroundings = NOTHING,
     ) -> None:
         """Log one tick, as :meth:`SessionWriter.tick` does; or count it."""
         now_ns = record.tick_ns
@@ -106,7 +109,7 @@ class RollingWriter:
             record = record._replace(events=(*record.events, gap))
         size = log.size
         try:
-            log.tick(record, frames, orders, timing=timing, pdci=pdci)
+            log.tick(record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
         except SourceError as error:
             self._refused(error, now_ns, self._open_ticks + 1)
             return
@@ -177,7 +180,12 @@ class RollingWriter:
         self.parts.append(part_path(self.path, number))
         self._written = self._open_ticks = 0
         self._log = SessionWriter(
-            self.parts[-1], ini_text=self._ini_text, configs={}, metadata=self._metadata | head, **self._names
+            self.parts[-1],
+            ini_text=self._ini_text,
+            configs={},
+            metadata=self._metadata | head,
+            probe_file=self._probe_file,
+            **self._names,
         )
         for name, (frame, time_ns) in self._configs.items():
             self._log.config(name, frame, time_ns)

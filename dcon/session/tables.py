@@ -170,32 +170,6 @@ def _event_rows(_: SessionReader, group: TickMessages) -> Iterator[Row]:
         yield group.tick_ns, "event", event.name, event.subject or None, event.detail or None, None
 
 
-def _flag_columns(_: SessionReader) -> tuple[Column, ...]:
-    return (
-        Column("tick_ns", "int64", nullable=False),
-        Column("flag", "string", nullable=False),
-        Column("up", "bool", nullable=False),
-    )
-
-
-def _flag_rows(session: SessionReader) -> Rows:
-    """One row each time that a flag rises or falls."""
-    known = 0
-
-    def rows(group: TickMessages) -> Iterator[Row]:
-        nonlocal known
-        tick = group.one("Tick")
-        if tick is None:
-            return
-        changed, known = known ^ tick.flags, tick.flags
-        for bit in range(changed.bit_length()):
-            if changed >> bit & 1:
-                name = session.flags[bit] if bit < len(session.flags) else str(bit)
-                yield group.tick_ns, name, bool(known >> bit & 1)
-
-    return rows
-
-
 _COLUMN_TYPES: dict[str, ColumnType] = {
     "double": "float64",
     "uint64": "uint64",
@@ -242,8 +216,7 @@ _OWN: dict[str, Table] = {
     "instance": Table(frozenset(("Instance",)), _instance_columns, _each(_instance_rows)),
     "pmu": Table(frozenset(("PmuFrame",)), _pmu_columns, _each(_pmu_rows)),
     "event": Table(frozenset(("Event", "Setting")), _event_columns, _each(_event_rows)),
-    "flag": Table(frozenset(("Tick",)), _flag_columns, _flag_rows),
 }
 _TOPICS = {message.topic.removeprefix("/dcon/"): name for name, message in MESSAGES.items() if name != "PmuFrame"}
 TABLES: dict[str, Table] = _OWN | {topic: _message_table(name) for topic, name in _TOPICS.items() if topic not in _OWN}
-"""Every topic has one; the first four are made for reading, ``flag`` is made of ``/dcon/tick``."""
+"""Every topic has one; the first four are made for reading."""

@@ -17,7 +17,6 @@ from dcon.core.rows import CORE
 from dcon.core.values import Event, Mode, Pdci, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
-from dcon.session.codec import Pdci
 from dcon.session.log import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
@@ -201,7 +200,7 @@ def _run(
         if tell is not None and number % TOLD_TICKS == 0:
             tell(outcome.tick_s[-1])
         if log is not None:
-            log.tick(tick.record, tick.readings, orders, pdci=_line(grid, tick_ns))
+            log.tick(tick.record, tick.readings, orders, pdci=_line(grid, tick_ns), surroundings=tick.surroundings)
 
 
 def _line(grid: Grid, tick_ns: int) -> Pdci:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import commands, controller, impairments, matrix, measures, player, streams, structure, studies
+from generate import api, commands, controller, impairments, live, matrix, measures, player, streams, structure, studies
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,

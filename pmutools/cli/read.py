@@ -46,10 +46,6 @@ def _triggers(text: str) -> Any:
 
     return parse_triggers(text)
 
-if TYPE_CHECKING:
-    from pmutools.cli.live_show import LiveShow
-    from pmutools.tools.reader import Reading
-
 
 @click.command(name="read", short_help="Read live streams and log them.")
 @click.argument("urls", nargs=-1, metavar="[URL]...")

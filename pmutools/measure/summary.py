@@ -99,7 +99,7 @@ def stream_summary(
     locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
     fitted_to, of = typical(counts.delays)
     fitted = best_fit(fitted_to) if fit else None
-    skew = None if result.clock_steps else result.course.drift()
+    skew = None if result.clock_steps else result.floor.drift()
     peak = counts.delays.evenness.peak(result.period_ns)
     names = [station.name for station in result.config.stations]
     diagnoses = diagnose(Scene(result, clock, others))

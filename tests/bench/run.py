@@ -16,7 +16,7 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # processor time is counted: idle threads must not spin
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench import capture, codec, control, measuring, pacing, receiving, startup, table
+from bench import capture, characterizing, codec, control, measuring, pacing, reading, receiving, startup, table
 from bench.layouts import BLOCK, LAYOUTS
 from bench.table import Row
 
@@ -32,6 +32,8 @@ def measured(*, quick: bool) -> Iterator[Row]:
     yield from control.rows(control.QUICK if quick else control.FULL)
     yield from measuring.rows(measuring.QUICK if quick else measuring.FULL)
     yield from receiving.rows(receiving.QUICK if quick else receiving.FULL)
+    yield from reading.rows(reading.QUICK if quick else reading.FULL)
+    yield from characterizing.rows(characterizing.QUICK if quick else characterizing.FULL)
     yield from pacing.rows(pacing.QUICK if quick else pacing.FULL)
 
 

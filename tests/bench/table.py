@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 from bench.stopwatch import Rate
 
-Group = Literal["codec", "capture", "start-up", "control", "measure", "live", "player"]
+Group = Literal["codec", "capture", "start-up", "control", "measure", "live", "read", "player"]
 BINDING: tuple[Group, ...] = ("codec", "capture", "start-up")
 """A missed budget of these groups is a failure."""
 HEAD = ("what", "ours", "against", "result", "budget", "")

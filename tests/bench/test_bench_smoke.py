@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bench import capture, codec, control, measuring, pacing, receiving, startup, table
+from bench import capture, characterizing, codec, control, measuring, pacing, reading, receiving, startup, table
 from bench.layouts import BLOCK, LAYOUTS, A, B, C, Layout
 from bench.stopwatch import Rate
 from bench.table import Budget, Row
@@ -43,7 +43,8 @@ def test_columns_are_what_tshark_prints(layout: Layout, tmp_path: Path, requires
 @pytest.mark.peer
 def test_every_group_gives_its_rows() -> None:
     rows = [*codec.rows(codec.QUICK), *startup.rows(startup.QUICK), *control.rows(control.QUICK)]
-    rows += [*measuring.rows(measuring.QUICK), *characterizing.rows(characterizing.QUICK)]
+    rows += [*measuring.rows(measuring.QUICK), *reading.rows(reading.QUICK)]
+    rows += [*characterizing.rows(characterizing.QUICK)]
     if shutil.which("tshark"):
         rows += capture.rows(capture.QUICK)
         assert {row.group for row in rows} == {"codec", "capture", "start-up", "control", "measure", "read"}

@@ -35,6 +35,7 @@ from pmutools.timebase import NS
 from pmutools.tools import live
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.recorder import names_of
+from pmutools.tools.recordings import saved_configs
 
 pytestmark = pytest.mark.realtime
 Item = Block | Message | Loss
@@ -221,6 +222,13 @@ def test_a_site_s_saved_configuration_serves_a_stream_that_never_sends_one(tmp_p
     (block,) = [item for item in items if isinstance(item, Block)]
     assert (len(block.batch), block.batch.config) == (20, config)
     assert source.name(block.flow, block.batch.config) == "N1"
+
+
+def test_saved_configurations_are_found_whatever_holds_them(tmp_path: Path) -> None:
+    for suffix in ("c37118", "mcap", "parquet"):
+        write(tmp_path / f"saved.{suffix}", recording(stream(7), 3))
+        (site,) = ini(tmp_path, "[pmu N1]", "url = udp://127.0.0.1:0", f"config = saved.{suffix}")
+        assert saved_configs([site]) == (stream(7),)
 
 
 def test_a_stream_is_called_by_all_its_sites(tmp_path: Path) -> None:

@@ -85,6 +85,8 @@ def _recorder(recording: Recording, source: LiveSource, tell: Callable[[str], No
     if keep is not None and recording.split is None and not recording.triggers:
         raise SettingsError("--keep counts files of --split or --trigger; add one of them")
     allow_all_files()
+    if not recording.to_stdout and (left := keep_journal(path)) is not None:
+        tell(f"{path} was not finished by the run before: its frames are kept in {left}; pmu convert makes them a file")
     if recording.triggers:
         _try(path, begin)
         watch = Watch(recording.triggers)
