@@ -410,6 +410,8 @@ class Demux:
         fitting = {config for config in known.values() if config.frame_size == size}
         if not fitting and (saved := self._saved.get(idcode)) and saved.frame_size == size:
             fitting = {saved}
+        if len(fitting) > 1:  # the same stream in two words, asked for here and sent unasked there
+            fitting -= {short for short in fitting for full in fitting if abridges(short, full)}
         if len(fitting) != 1:
             return None
         config = fitting.pop()

@@ -348,7 +348,7 @@ def test_not_made_of_what_is_only_near(case: str, near: Scene) -> None:
 
 
 def skew_ppm(result: StreamResult) -> float | None:
-    (told,) = summary([result], clock(), fits=False)["streams"]
+    (told,) = summary([result], clock(), may_fit=lambda: False)["streams"]
     found: float | None = told["skew_ppm"]
     return found
 

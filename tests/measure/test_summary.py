@@ -199,7 +199,7 @@ def dropped(lost: int, own: int) -> Any:
 
 
 def test_own_drops_are_no_loss_of_the_network() -> None:
-    told = summary([dropped(200, 150)], ClockLog(), fits=False)
+    told = summary([dropped(200, 150)], ClockLog(), may_fit=lambda: False)
     (stream,) = told["streams"]
     assert (stream["lost"], stream["lost_own_at_most"], told["all"]["lost_own_at_most"]) == (200, 150, 150)
     asked = parse_requirements("loss<=1%,all.loss<=1%,loss<=10%,availability>=99%,delay_p99<=10ms")
