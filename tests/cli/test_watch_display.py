@@ -283,7 +283,7 @@ def test_read_live(synthetic: Path, tmp_path: Path) -> None:
     with on_a_terminal(reading, tmp_path) as (master, process):
         wait_for("nothing has come yet", master)
         with started("play", synthetic, "--to", url, "--loop", 0, "--duration", 30, "--quiet"):
-            wait_for("8 streaming", master)
+            wait_for("  8 streaming", master)
             wait_for("x.pcap 0.", master)
             os.write(master, b"v")
             wait_for("cmpl%", master)

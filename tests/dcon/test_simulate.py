@@ -190,7 +190,7 @@ def test_ctrl_c_ends_a_sweep_and_its_processes() -> None:
         assert sweep.stdout is not None
         assert sweep.stdout.readline() == "[\n" and sweep.stdout.readline().startswith('{"scenario"')
         os.killpg(sweep.pid, signal.SIGINT)
-        _, said = sweep.communicate(timeout=10)  # to the end of both pipes: every process that had them is gone
+        _, said = sweep.communicate(timeout=30)  # to the end of both pipes: every process that had them is gone
         assert (sweep.returncode, said) == (130, "")
 
 
