@@ -303,7 +303,7 @@ QUIRKS = {
         "uneven-arrival",
         "periodic-delay",
     },
-    "c37_1100_fullclean.pcap": {"unsynchronised"},
+    "c37_1100_fullclean.pcap": {"unsynchronised", "clock-off"},
 }
 
 

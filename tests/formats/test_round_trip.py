@@ -18,7 +18,7 @@ from support.recordings import blocks_of, data_of, messages_of, read, write, wri
 from support.wire import command_frame, header_frame
 
 from pmutools.c37118 import Frame, FrameType, Message
-from pmutools.c37118.batch import Batch
+from pmutools.c37118.batch import Batch, joined
 from pmutools.errors import PmuError, SourceError
 from pmutools.flow import Flow, StampSource
 from pmutools.formats import open_sink, open_source
@@ -134,7 +134,7 @@ def columns(path: Path) -> dict[int, Batch]:
     parts: dict[int, list[Batch]] = {}
     for block in blocks_of(open_source(path)):
         parts.setdefault(block.batch.config.idcode, []).append(block.batch)
-    return {idcode: batches[0] for idcode, batches in parts.items() if len(batches) == 1}
+    return {idcode: joined(batches) for idcode, batches in parts.items() if len({b.config for b in batches}) == 1}
 
 
 def same_values(before: Batch, after: Batch) -> None:

@@ -61,4 +61,4 @@ def test_an_unsynchronised_device_with_usable_values() -> None:
     assert stream["delay_locked_ms"]["count"] == 0
     assert stream["uncertainty_ms"] is None
     assert stream["per_window"] == {"0": 0, "1": 422, "2+": 0}
-    assert ids(stream) == {"unsynchronised"}
+    assert ids(stream) == {"unsynchronised", "clock-off"}
