@@ -7,7 +7,9 @@ step in latency.
 
 from __future__ import annotations
 
+import copy
 import math
+from array import array
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -103,8 +105,7 @@ class FloorMeter:
         self._least = _NEVER
         self._last: list[tuple[int, int]] = []
         """(bucket, least) of the last :data:`MEMORY` buckets before this one."""
-        self._course: list[tuple[int, int]] = []
-        self._width = 1
+        self._course = _Course()
 
     def restart(self) -> None:
         """The delays that come next have nothing to do with those before; the course goes on."""
@@ -135,25 +136,37 @@ class FloorMeter:
         if self._bucket is None or self._least == _NEVER:
             return
         self._last.append((self._bucket, self._least))
-        _append(self._course, self._bucket - self._bucket % self._width, self._least)
-        while len(self._course) > POINTS:
-            self._width *= 2
-            merged: list[tuple[int, int]] = []
-            for bucket, least in self._course:
-                _append(merged, bucket - bucket % self._width, least)
-            self._course = merged
+        self._course.add(self._bucket, self._least)
 
     def course(self) -> FloorCourse:
         """The floor so far."""
-        points = list(self._course)
+        course = copy.deepcopy(self._course)
         if self._bucket is not None and self._least != _NEVER:
-            _append(points, self._bucket - self._bucket % self._width, self._least)
-        table = np.array(points, np.int64).reshape(-1, 2)
-        return FloorCourse(table[:, 0] * BUCKET_NS, table[:, 1])
+            course.add(self._bucket, self._least)
+        return FloorCourse(np.array(course.buckets, np.int64) * BUCKET_NS, np.array(course.least_ns, np.int64))
 
 
-def _append(course: list[tuple[int, int]], bucket: int, least: int) -> None:
-    if course and course[-1][0] == bucket:
-        course[-1] = (bucket, min(course[-1][1], least))
-    else:
-        course.append((bucket, least))
+class _Course:
+    """The least of each bucket, in 16 bytes a point: thousands of streams keep one for as long as they last."""
+
+    def __init__(self) -> None:
+        self.buckets, self.least_ns = array("q"), array("q")
+        self._width = 1
+
+    def add(self, bucket: int, least_ns: int) -> None:
+        """The next bucket."""
+        self._append(bucket, least_ns)
+        while len(self.buckets) > POINTS:
+            self._width *= 2
+            points = list(zip(self.buckets, self.least_ns, strict=True))
+            self.buckets, self.least_ns = array("q"), array("q")
+            for point in points:
+                self._append(*point)
+
+    def _append(self, bucket: int, least_ns: int) -> None:
+        start = bucket - bucket % self._width
+        if self.buckets and self.buckets[-1] == start:
+            self.least_ns[-1] = min(self.least_ns[-1], least_ns)
+        else:
+            self.buckets.append(start)
+            self.least_ns.append(least_ns)

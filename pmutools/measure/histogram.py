@@ -8,6 +8,8 @@ whichever is more (:func:`error_ns`). Count, mean, standard deviation, least and
 from __future__ import annotations
 
 import math
+from array import array
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -37,6 +39,10 @@ _PAGE = 1 << _PAGE_BITS
 _NARROW = np.iinfo(np.uint32).max
 _DENSE = 1 << 14
 """A batch that spans more bins is sorted rather than counted in an array."""
+_FEW = 16
+"""Fewer bins of a page than so many are kept one by one, 16 bytes each."""
+_LOOKED_FROM = 128
+"""So many bins kept one by one are looked through for pages that have become worth it."""
 
 Ints = npt.NDArray[np.int64]
 
@@ -62,7 +68,19 @@ def error_ns(value_ns: float) -> float:
 class Histogram:
     """How often each duration came. ``merge`` of two is the histogram of all their values, to the last count."""
 
-    __slots__ = ("_kept", "_m2", "_mean", "_pages", "_type", "count", "max_ns", "min_ns")
+    __slots__ = (
+        "_few",
+        "_few_counts",
+        "_few_most",
+        "_kept",
+        "_m2",
+        "_mean",
+        "_pages",
+        "_type",
+        "count",
+        "max_ns",
+        "min_ns",
+    )
 
     def __init__(self, values_ns: npt.ArrayLike = ()) -> None:
         self.count = 0
@@ -70,6 +88,9 @@ class Histogram:
         self.max_ns: int | None = None
         self._mean, self._m2 = 0.0, 0.0
         self._pages: dict[int, npt.NDArray[Any]] = {}
+        self._few, self._few_counts = array("q"), array("q")
+        """Bins far from most, in order: a stall that delays a frame of each of many streams must not open pages."""
+        self._few_most = _LOOKED_FROM
         self._type: type[np.integer[Any]] = np.uint32
         self._kept: tuple[Ints, Ints, Ints] | None = None
         """What :meth:`_filled` found since the last value came, and the sums of its counts."""
@@ -90,19 +111,61 @@ class Histogram:
         if last - first < _DENSE:
             base = first & -_PAGE
             counts = np.bincount(indices - base, minlength=(last | _PAGE - 1) + 1 - base)
-            pages = counts.reshape(-1, _PAGE).astype(self._type)
+            pages = counts.reshape(-1, _PAGE)
             for at in np.flatnonzero(pages.any(1)).tolist():
-                self._page((base >> _PAGE_BITS) + at)[...] += pages[at]
+                number = (base >> _PAGE_BITS) + at
+                if (page := self._pages.get(number)) is not None:
+                    page += pages[at].astype(self._type)
+                else:
+                    bins = np.flatnonzero(pages[at])
+                    self._count(number, bins, pages[at][bins])
             return
         found, counts = np.unique(indices, return_counts=True)
-        for number in np.unique(found >> _PAGE_BITS).tolist():
-            here = found >> _PAGE_BITS == number
-            self._page(number)[found[here] & _PAGE - 1] += counts[here].astype(self._type)
+        self._count_all(found, counts)
 
-    def _page(self, number: int) -> npt.NDArray[Any]:
+    def _count_all(self, indices: Ints, counts: Ints) -> None:
+        """Add to bins (B,), in order."""
+        if not len(indices):
+            return
+        numbers = indices >> _PAGE_BITS
+        for here in np.split(np.arange(len(indices)), np.flatnonzero(np.diff(numbers)) + 1):
+            self._count(int(numbers[here[0]]), indices[here] & _PAGE - 1, counts[here])
+
+    def _count(self, number: int, bins: Ints, counts: Ints) -> None:
+        """Add to bins (B,) of a page, on the page or, where there is none and B is small, one by one."""
+        first = number << _PAGE_BITS
         if (page := self._pages.get(number)) is None:
+            if len(bins) < _FEW:
+                for at, count in zip(bins.tolist(), counts.tolist(), strict=True):
+                    self._count_one(first + at, count)
+                if len(self._few) > self._few_most:
+                    self._open_pages()
+                return
             page = self._pages[number] = np.zeros(_PAGE, self._type)
-        return page
+            start, end = (bisect_left(self._few, edge) for edge in (first, first + _PAGE))
+            page[np.array(self._few[start:end], np.int64) - first] = self._few_counts[start:end]
+            del self._few[start:end], self._few_counts[start:end]
+        page[bins] += counts.astype(self._type)
+
+    def _count_one(self, index: int, count: int) -> None:
+        place = bisect_left(self._few, index)
+        if place < len(self._few) and self._few[place] == index:
+            self._few_counts[place] += count
+        else:
+            self._few.insert(place, index)
+            self._few_counts.insert(place, count)
+
+    def _open_pages(self) -> None:
+        """Open the pages of bins kept one by one that have become many."""
+        indices, counts = self._kept_singly()
+        numbers, sizes = np.unique(indices >> _PAGE_BITS, return_counts=True)
+        many = np.isin(indices >> _PAGE_BITS, numbers[sizes >= _FEW])
+        self._few, self._few_counts = (array("q", column[~many].tolist()) for column in (indices, counts))
+        self._count_all(indices[many], counts[many])
+        self._few_most = _LOOKED_FROM + 2 * len(self._few)
+
+    def _kept_singly(self) -> tuple[Ints, Ints]:
+        return np.array(self._few, np.int64), np.array(self._few_counts, np.int64)
 
     def _combine(self, count: int, mean: float, m2: float, low: int, high: int) -> None:
         """Take in the moments of ``count`` more values (Chan, Golub and LeVeque 1979)."""
@@ -123,8 +186,7 @@ class Histogram:
         if other.min_ns is None or other.max_ns is None:
             return
         self._combine(other.count, other._mean, other._m2, other.min_ns, other.max_ns)
-        for number, page in other._pages.items():
-            self._page(number)[...] += page.astype(self._type)
+        self._count_all(*other._found())
 
     def __eq__(self, other: object) -> bool:
         """Whether both counted the same in every bin; means may differ in their last bits."""
@@ -162,13 +224,16 @@ class Histogram:
         return self._kept
 
     def _found(self) -> tuple[Ints, Ints]:
+        few, few_counts = self._kept_singly()
         if not self._pages:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+            return few, few_counts
         numbers = sorted(self._pages)
         counts = np.concatenate([self._pages[number] for number in numbers]).astype(np.int64)
         indices = (np.array(numbers)[:, None] * _PAGE + np.arange(_PAGE)).reshape(-1)
         filled = counts > 0
-        return indices[filled], counts[filled]
+        indices, counts = indices[filled], counts[filled]
+        places = np.searchsorted(indices, few)
+        return np.insert(indices, places, few), np.insert(counts, places, few_counts)
 
     def quantile_ns(self, share: float, lost: int = 0) -> float | None:
         """The smallest value that at least ``share`` of all do not exceed (the nearest rank, as in RFC 2330).

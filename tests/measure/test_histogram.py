@@ -88,8 +88,22 @@ def test_at_most_counts_whole_bins(found: list[int], limit: int) -> None:
 
 def test_memory_does_not_grow_with_wild_values() -> None:
     histogram = Histogram([44_000_000, 63 * 86_400 * 10**9, -5 * 86_400 * 10**9, 0])
-    assert len(histogram._pages) == 4
+    assert not histogram._pages
     assert [n for *_, n in histogram.bins()] == [1, 1, 1, 1]
+
+
+def test_bins_far_from_most_are_kept_one_by_one_until_they_are_many() -> None:
+    usual, stalls = np.arange(16_000_000, 16_200_000, 1000), np.arange(300_000_000, 500_000_000, 4_000_000)
+    histogram = Histogram(usual)
+    for stall in stalls.tolist():
+        histogram.add(np.array([16_000_000, stall]))
+    opened = len(histogram._pages)
+    assert len(histogram._few) == len(stalls)
+    assert histogram == Histogram([*usual.tolist(), *stalls.tolist(), *[16_000_000] * len(stalls)])
+    for near in range(300_000_000, 400_000_000, 300_000):
+        histogram.add(np.array([near]))
+    assert len(histogram._pages) > opened
+    assert histogram.count == len(usual) + 2 * len(stalls) + 334 == int(histogram.bins().count.sum())
 
 
 @given(st.lists(st.integers(0, 10**6), max_size=100), st.lists(st.integers(0, 300), max_size=100))
