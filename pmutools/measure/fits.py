@@ -1,10 +1,10 @@
 """Distributions fitted to what was measured, as text of the impairment grammar: ``normal(44.1, 1.3)``.
 
-Each family is fitted to the histogram by an estimator of its own (below); what is judged is the text itself, read back
-by :mod:`pmutools.impair`: its goodness is the Kolmogorov-Smirnov distance, the largest difference of the two
-distribution functions. The fit is the simplest family whose distance is within a quarter, or 0.005, of the best one's.
-Where the best is above :data:`POOR`, and above what chance makes of so few values (1.36/√n, at the 5 % level), none of
-them is like what was measured, and the histogram itself stands in.
+Each family is fitted to the histogram by an estimator of its own (below). What is judged is the text itself, read back
+by :mod:`pmutools.impair`: its Kolmogorov-Smirnov distance, and whether its tail holds
+(:mod:`pmutools.measure.likeness`). The fit is, of the families whose tail holds, the simplest whose distance is within
+a quarter, or 0.005, of the best one's. Where none holds, or the best is above :data:`POOR` and above what chance makes
+of so few values (1.36/√n, at the 5 % level), the histogram itself stands in, and the nearest family is told beside it.
 
 =========== ==========================================================================================
 constant    where all lies within a microsecond or two
@@ -13,7 +13,7 @@ normal      maximum likelihood; or median and the middle 68 %, where a few outli
 exponential maximum likelihood from the least value on
 lognormal   shift by quantiles; mean and sd of the logarithm
 gamma       shift by quantiles, or 0; maximum likelihood by Minka's approximation
-weibull     shift by the least value; maximum likelihood by Newton's method
+weibull     shift by the least value; maximum likelihood by Newton's method, or by two quantiles
 pareto      probability-weighted moments of the excess over the least value (Hosking and Wallis 1987)
 =========== ==========================================================================================
 """
@@ -21,16 +21,17 @@ pareto      probability-weighted moments of the excess over the least value (Hos
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.impair.distributions import distribution
 from pmutools.impair.quantiles import normal_cdf
+from pmutools.measure.binned import histogram_text
 from pmutools.measure.delay import DelayCounts
 from pmutools.measure.histogram import NS_PER_MS, Histogram, ms
+from pmutools.measure.likeness import Allowed, TailError, allowed, ks_distance, tail_error
 from pmutools.timebase import NS
 
 POOR = 0.05
@@ -38,11 +39,8 @@ POOR = 0.05
 UNLIKELY_NS = 10 * NS
 LIKE = 1.25
 LIKE_MARGIN = 0.005
-MOST_BINS = 120
-"""Of an exported histogram."""
 _CHANCE = 1.36
 _ENOUGH = 50
-_QUANTILES = 4001
 
 Floats = npt.NDArray[np.float64]
 
@@ -56,11 +54,16 @@ def typical(delays: DelayCounts) -> tuple[Histogram, str]:
 
 
 class Fit(NamedTuple):
-    """A distribution in ms, and its KS distance from what was measured."""
+    """A distribution in ms, its KS distance from what was measured, and where its quantiles are furthest off.
+
+    ``nearest``, of a histogram that stands in: what it stands in for.
+    """
 
     text: str
     ks: float
     frames: int
+    tail: TailError
+    nearest: Fit | None = None
 
     @property
     def name(self) -> str:
@@ -71,9 +74,30 @@ class Fit(NamedTuple):
         """As the grammar writes them: numbers, and ``key=number``."""
         return [part.strip() for part in self.text.partition("(")[2].rstrip(")").split(",")]
 
+    @property
+    def unlike(self) -> bool:
+        """As a whole, not in its tail alone."""
+        return self.ks > _most_ks(self.frames)
+
+    @property
+    def fault(self) -> str:
+        """Why it is not exported; nothing where it may be."""
+        if self.unlike:
+            return f"its KS distance is {self.ks:.3f}"
+        return "" if self.tail.holds else f"its {self.tail.words}"
+
     def to_json(self) -> dict[str, object]:
         long = len(self.params) > 8
-        return {"name": self.name, "params": [] if long else self.params, "ks": self.ks, "text": self.text}
+        return {
+            "name": self.name,
+            "params": [] if long else self.params,
+            "ks": self.ks,
+            "text": self.text,
+            "tail_error_ms": self.tail.error_ms,
+            "tail_error_at": self.tail.at,
+            "tail_holds": self.tail.holds,
+            "nearest": self.nearest.to_json() if self.nearest else None,
+        }
 
 
 class _Sample(NamedTuple):
@@ -169,6 +193,9 @@ def _weibull(sample: _Sample) -> Iterator[str]:
         if abs(step) < 1e-9 * shape:
             break
     yield _text("weibull", shape, sample.average(excess**shape) ** (1 / shape), shift=sample.least)
+    scale, late = (sample.quantile(share) - sample.least for share in (1 - 1 / math.e, 0.99))
+    if late > scale > 0 and (shape := math.log(math.log(100)) / math.log(late / scale)) >= 0.06:
+        yield _text("weibull", shape, scale, shift=sample.least)
 
 
 def _pareto(sample: _Sample) -> Iterator[str]:
@@ -200,68 +227,47 @@ def fits(measured: Histogram) -> list[Fit]:
     sample = _sample(measured)
     if sample is None or sample.sd <= 0:
         return []
-    found = []
+    held_to, found = allowed(measured), list[Fit]()
     for family in FAMILIES.values():
-        candidates = [Fit(text, ks_distance(text, measured), measured.count) for text in family(sample)]
+        candidates = [_judged(text, measured, held_to) for text in family(sample)]
         if candidates:
-            found.append(min(candidates, key=lambda fit: fit.ks))
+            found.append(min(candidates, key=lambda fit: (not fit.tail.holds, fit.ks)))
     return found
+
+
+def nearest(found: Sequence[Fit]) -> Fit | None:
+    """Of those that are like it as a whole (or else of all) the one that is least off in its quantiles."""
+    return min(found, key=lambda fit: (fit.unlike, fit.tail.score), default=None)
 
 
 def best_fit(measured: Histogram) -> Fit | None:
     """The fit by the rule of this module; None of fewer than 50 values."""
     if measured.count < _ENOUGH or measured.min_ns is None or measured.max_ns is None or measured.mean_ns is None:
         return None
+    held_to = allowed(measured)
     if measured.max_ns - measured.min_ns <= 2000:
-        return Fit(_text("constant", measured.mean_ns / NS_PER_MS), 0.0, measured.count)
+        return _judged(_text("constant", measured.mean_ns / NS_PER_MS), measured, held_to)._replace(ks=0.0)
     sample = _sample(measured)
     assert sample is not None
-    first = min((ks_distance(text, measured), text) for text in _normal(sample))
-    if first[0] <= LIKE_MARGIN:  # no other can beat it
-        return Fit(first[1], first[0], measured.count)
+    first = min((_judged(text, measured, held_to) for text in _normal(sample)), key=lambda fit: fit.ks)
+    if first.ks <= LIKE_MARGIN and first.tail.holds:  # no other can beat it
+        return first
     found = fits(measured)
-    least = min((fit.ks for fit in found), default=1.0)
-    if least > max(POOR, _CHANCE / math.sqrt(measured.count)):
-        text = histogram_text(measured)
-        return Fit(text, ks_distance(text, measured), measured.count)
-    return next(fit for fit in found if fit.ks <= max(least * LIKE, least + LIKE_MARGIN))
+    holding = [fit for fit in found if fit.tail.holds]
+    least = min((fit.ks for fit in holding), default=1.0)
+    if least > _most_ks(measured.count):
+        stand_in = _judged(histogram_text(measured), measured, held_to)
+        return stand_in._replace(nearest=nearest(found))
+    return next(fit for fit in holding if fit.ks <= max(least * LIKE, least + LIKE_MARGIN))
 
 
-def histogram_text(measured: Histogram, most_bins: int = MOST_BINS) -> str:
-    """What was measured, as ``histogram(low, high, count, ...)`` in ms, of so many bins of about equal count.
-
-    Wide stretches where nothing was measured lie between bins, so there may be up to twice as many.
-    """
-    bins = measured.bins()
-    low = np.maximum(bins.low_ns, measured.min_ns or 0)
-    high = np.minimum(bins.high_ns, measured.max_ns or 0)
-    groups = np.minimum((np.cumsum(bins.count) - bins.count) * most_bins // max(1, measured.count), most_bins - 1)
-    gaps = (
-        np.concatenate(([0], (low[1:] - high[:-1] > (high[-1] - low[0]) // most_bins).cumsum())) if len(low) else groups
-    )
-    starts = np.flatnonzero(np.diff(groups * (len(low) + 1) + gaps, prepend=-1))
-    rows = []
-    for first, end in zip(starts, [*starts[1:], len(low)], strict=True):
-        rows.append(f"{low[first] / NS_PER_MS:.9g}, {high[end - 1] / NS_PER_MS:.9g}, {bins.count[first:end].sum()}")
-    return f"histogram({',  '.join(rows)})"
+def _judged(text: str, measured: Histogram, held_to: list[Allowed]) -> Fit:
+    return Fit(text, ks_distance(text, measured), measured.count, tail_error(text, held_to))
 
 
-def quantile_table(text: str) -> tuple[Floats, Floats]:
-    """Shares (Q,), close together at both ends, and the values in ms that those shares of ``text`` do not exceed."""
-    draws = 1 / (1 + np.exp(-np.linspace(-16, 16, _QUANTILES)))
-    return draws, distribution(text).quantile()(draws)
-
-
-def ks_distance(text: str, measured: Histogram) -> float:
-    """The largest difference of the distribution functions of ``text`` (ms) and of what was measured."""
-    bins = measured.bins()
-    share = np.cumsum(bins.count) / measured.count
-    edges = np.minimum(bins.high_ns, measured.max_ns or 0) / NS_PER_MS
-    draws, values = quantile_table(text)
-    at = np.interp(edges, values, draws, left=0.0, right=1.0)
-    below = np.interp(bins.low_ns / NS_PER_MS, values, draws, left=0.0, right=1.0)
-    before = np.concatenate(([0.0], share[:-1]))
-    return float(max(np.abs(at - share).max(), np.abs(below - before).max()))
+def _most_ks(count: int) -> float:
+    """A larger distance is no likeness."""
+    return max(POOR, _CHANCE / math.sqrt(count))
 
 
 def _sample(measured: Histogram) -> _Sample | None:

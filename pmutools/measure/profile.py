@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from pmutools.measure.fits import best_fit, histogram_text, typical
+from pmutools.measure.binned import histogram_text
+from pmutools.measure.fits import Fit, best_fit, typical
 from pmutools.measure.stream import StreamResult
 
 LEAST_CORRELATION = 0.05
@@ -35,7 +36,7 @@ def _section(result: StreamResult, exact: bool) -> list[str]:
         lines.append("; above the floor: by the delays themselves a clock is wrong")
     if fit := best_fit(delays):
         lines.append(f"delay = {histogram_text(delays) if exact else fit.text}{_manner(result)}")
-        lines.append(f"; {fit.name}, KS distance {fit.ks:.3f}, {fit.frames} frames" if not exact else "; as counted")
+        lines.append(f"; {_why(fit, exact)}, {fit.frames} frames")
     lost, own = counts.slots.lost, counts.own_lost
     if own:
         lines.append(f"; {own} of the {lost} lost frames may be own drops of the measuring host: left out of the loss")
@@ -45,6 +46,13 @@ def _section(result: StreamResult, exact: bool) -> list[str]:
     if counts.slots.duplicated:
         lines.append(f"duplicate = {min(1.0, counts.slots.duplicated / counts.slots.received):.4%}")
     return lines
+
+
+def _why(fit: Fit, exact: bool) -> str:
+    """What the delays are told by, and what is wrong with the nearest family where it is the histogram."""
+    if exact or not fit.nearest:
+        return "as counted" if exact or fit.name == "histogram" else f"{fit.name}, KS distance {fit.ks:.3f}"
+    return f"as counted: {fit.nearest.text} is the nearest, and {fit.nearest.fault}"
 
 
 def _patterns(result: StreamResult) -> list[str]:

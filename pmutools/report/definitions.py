@@ -164,5 +164,12 @@ TERMS = (
         "",
         "Kolmogorov-Smirnov distance: the largest difference of two distribution functions, 0 to 1.",
     ),
+    Term(
+        "term-furthest-off",
+        "furthest off",
+        "",
+        "Which of p50, p90, p99, p99.9 and the largest a fit misses most, by what is allowed there, and by how much: "
+        "5 % of what lies between p1 and there, or what chance leaves open. KS does not see a tail; this does.",
+    ),
 )
 """In the order of the page."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from pmutools.measure.fits import Fit, quantile_table
+from pmutools.measure.fits import POOR
 from pmutools.measure.histogram import NS_PER_MS, Histogram, error_ns
+from pmutools.measure.likeness import quantile_table
 from pmutools.report import theme
 from pmutools.report.figures import Axis, Band, Bars, Dash, Dots, Figure, Floats, Line, Mark, Panel, Rule, Scale
 from pmutools.report.text import count, milliseconds, percent
@@ -17,6 +20,7 @@ BINS, LEAST_BINS = 90, 15
 TAIL_POINTS = 400
 _LOG_FROM = 20.0
 """Delays that reach so many times their least are drawn on a logarithmic axis."""
+_TAIL_CAPTION = "CCDF: what share of frames comes later than x. Where the lost never come, the curve ends on the loss."
 _NAMES = {"delay": "stamp-to-arrival delay (ms)", "pdv": "delay above its floor, PDV (ms)"}
 
 
@@ -44,18 +48,26 @@ def _below(found: Histogram, edges_ns: Floats) -> Floats:
 
 
 class Model:
-    """A fitted distribution to draw: its name, and its distribution function."""
+    """A fitted distribution to draw: its name, its distribution function, and words about its tail.
 
-    def __init__(self, fit: Fit, like: bool) -> None:
-        self._draws, self._values = quantile_table(fit.text)
-        family = fit.text.partition("(")[0]
-        self.name = (
-            f"{family} fit, KS {fit.ks:.3f}" if like else f"{family}, the nearest, is no likeness: KS {fit.ks:.2f}"
-        )
+    ``told`` is the fit as the summary tells it, or the nearest family where the histogram ``stands_in``.
+    """
+
+    def __init__(self, told: Mapping[str, Any], stands_in: bool) -> None:
+        self._draws, self._values = quantile_table(told["text"])
+        name, ks, holds = told["name"], told["ks"], told["tail_holds"]
+        fault = f"is no likeness: KS {ks:.2f}" if holds or ks > POOR else "does not hold the tail"
+        self.name = f"{name}, the nearest, {fault}" if stands_in else f"{name} fit, KS {ks:.3f}"
+        off = f"{told['tail_error_at']} is {abs(told['tail_error_ms']):.3g} ms too {_side(told['tail_error_ms'])}"
+        self.tail_words = "" if holds else f"Of the {name} distribution {off}: the tail does not hold."
 
     def below(self, x_ms: Floats) -> Floats:
         """(N,) share of the values at most each x."""
         return np.interp(x_ms, self._values, self._draws, left=0.0, right=1.0)
+
+
+def _side(error_ms: float) -> str:
+    return "large" if error_ms > 0 else "small"
 
 
 def model(stream: Stream) -> Model | None:
@@ -63,11 +75,9 @@ def model(stream: Stream) -> Model | None:
     told = stream.told["fit"]
     if told is None or told["name"] == "constant":
         return None
-    found = stream.typical[0]
-    if told["name"] != "histogram":
-        return Model(Fit(told["text"], told["ks"], found.count), True)
-    nearest = min(stream.fits, key=lambda fit: fit.ks, default=None)
-    return Model(nearest, False) if nearest is not None else None
+    if told["nearest"] is not None:
+        return Model(told["nearest"], True)
+    return Model(told, False) if told["name"] != "histogram" else None
 
 
 def distribution_figure(stream: Stream) -> Figure:
@@ -191,7 +201,7 @@ def tail_figure(stream: Stream) -> Figure:
         f"Complementary distribution function of {stream.label}: {_percentile_words(found)}",
         Axis(_NAMES[kind], Scale.LOG if log else Scale.LINEAR, shown),
         [Panel(Axis("share that is later", Scale.LOG, (least, 1.5)), marks)],
-        "CCDF: what share of frames comes later than x. Where the lost never come, the curve ends on the loss.",
+        " ".join(filter(None, (_TAIL_CAPTION, fitted.tail_words if fitted else ""))),
         430,
     )
 

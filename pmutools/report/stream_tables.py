@@ -105,17 +105,29 @@ def uncertainty_table(stream: Stream) -> Table:
 
 def fits_table(stream: Stream) -> Table:
     """Families of distributions, as impairments that a player takes."""
-    columns = [Column("Distribution", words=True), Column("KS", term="term-ks"), Column("", words=True)]
+    columns = [
+        Column("Distribution", words=True),
+        Column("KS", term="term-ks"),
+        Column("furthest off (ms)", words=True, term="term-furthest-off"),
+        Column("", words=True),
+    ]
     told = stream.told["fit"]
     chosen = told["text"] if told else ""
     rows = [
-        Row([Cell(fit.text), Cell(f"{fit.ks:.4f}", fit.ks), Cell("the fit" if fit.text == chosen else "")])
+        Row(
+            [
+                Cell(fit.text),
+                Cell(f"{fit.ks:.4f}", fit.ks),
+                Cell(f"{fit.tail.at}: {fit.tail.error_ms:+.3g}{'' if fit.tail.holds else ', does not hold'}"),
+                Cell("the fit" if fit.text == chosen else ""),
+            ]
+        )
         for fit in sorted(stream.fits, key=lambda fit: fit.ks)
     ]
     what = "the delays" if stream.typical[1] == "delay" else "PDV, since the delays are a clock's error"
-    note = "The fit is the simplest that is about as near as the nearest."
+    note = "The fit is the simplest that is about as near as the nearest of those whose quantiles hold."
     if told and told["name"] == "histogram":
-        note = "None of them is like what was measured: the exported profile has the histogram itself."
+        note = "None of them is like what was measured, tail included: the exported profile has the histogram itself."
     return Table(f"{stream.anchor}-fits", f"Distributions fitted to {what} (ms)", columns, rows, note)
 
 

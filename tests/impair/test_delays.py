@@ -12,8 +12,11 @@ from hypothesis import strategies as st
 from scipy import stats
 from support.impairment import PERIOD_NS, delays_ms, frame, options, pipeline, play
 
+from pmutools.draws import Draws
 from pmutools.impair import Fate, Pipeline, parse_profile
 from pmutools.impair.blocks import ANCHOR
+from pmutools.impair.delays import DrawnTerms
+from pmutools.impair.distributions import distribution
 from pmutools.impair.stages import parse_setting
 
 N = 20_000
@@ -102,6 +105,24 @@ def test_correlation_leaves_the_distribution_exact(rho: float) -> None:
     for lag in (1, 2):
         found = np.corrcoef(z[lag:], z[:-lag])[0, 1]
         assert abs(found - rho**lag) < 5 / math.sqrt(effective)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize(
+    "text",
+    ["lognormal(6, 6, shift=20)", "pareto(2, 6)", "histogram(40, 45, 800,  45, 50, 190,  70, 72, 9,  99, 100, 1)"],
+)
+def test_correlation_leaves_the_tail_exact(text: str, rho: float) -> None:
+    """As many frames lie beyond a quantile as should; correlated ones come in clusters, so their number varies more."""
+    count = 200_000
+    draws, quantile = Draws(1, "N1", "delay"), distribution(text).quantile()
+    terms = DrawnTerms({0: distribution(text)}, draws, corr=rho)
+    terms.begin(0)
+    values = np.array(terms.run(0, count)) / 1e6
+    for share in (0.01, 0.5, 0.99, 0.9985):
+        beyond = np.mean(values > quantile(np.array([share]))[0])
+        spread = math.sqrt(share * (1 - share) / count * (1 + rho) / (1 - rho))
+        assert abs(beyond - (1 - share)) < 4 * spread + 1e-6
 
 
 def test_correlation_goes_on_over_blocks_and_starts_afresh_at_anchors() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from support.measured import START_NS, arranged, batch, measured, rows, stamps
@@ -9,8 +11,10 @@ from support.measured import START_NS, arranged, batch, measured, rows, stamps
 from pmutools.draws import Draws
 from pmutools.impair.distributions import distribution
 from pmutools.impair.profile import parse_profile
-from pmutools.measure.fits import FAMILIES, MOST_BINS, POOR, best_fit, fits, histogram_text, ks_distance
+from pmutools.measure.binned import histogram_text
+from pmutools.measure.fits import FAMILIES, POOR, best_fit, fits
 from pmutools.measure.histogram import Histogram
+from pmutools.measure.likeness import ks_distance
 from pmutools.measure.profile import loss_text, profile_text
 from pmutools.measure.stream import Identity
 
@@ -61,7 +65,7 @@ def test_recognised_and_played_again(text: str) -> None:
 def test_the_histogram_stands_in_for_anything(text: str) -> None:
     values = drawn(text)
     told = histogram_text(histogram(values))
-    assert told.count(",") < 3 * 2 * MOST_BINS
+    assert told.count(",") < 3 * (80 + 8 * math.log(2 * COUNT) + 60)
     if "-37000" in text:  # so far out a bin is 16 ms wide
         assert np.ptp(drawn(told, "b")) == pytest.approx(np.ptp(values), rel=0.1)
     else:

@@ -24,6 +24,7 @@ from pmutools.report.figures import (
     Axis,
     Band,
     Bars,
+    Dash,
     Dots,
     Figure,
     Heat,
@@ -162,6 +163,22 @@ def test_histogram_and_tail_count_every_frame() -> None:
     assert expected.y[-1] == pytest.approx(told["lost"] / (told["lost"] + found.count))
     at = np.interp(told["delay_ms"]["p99"], received.x, received.y)
     assert at == pytest.approx(0.01, abs=0.003)
+
+
+def test_a_fit_that_does_not_hold_the_tail_is_told_so() -> None:
+    made = run_of([Made("N1", late=0.01), Made("N2")])
+    tails = {found.name: found for found in compose(made)[1] if found.name.endswith("-tail")}
+    late, even = tails["001-n1-tail"], tails["002-n2-tail"]
+    (nearest,) = [mark for mark in late.panels[0].marks if isinstance(mark, Line) and mark.dash is Dash.DOTTED]
+    told = made.summary["streams"][0]["fit"]
+    assert told["name"] == "histogram"
+    family = told["nearest"]["name"]
+    assert nearest.name == f"{family}, the nearest, does not hold the tail"
+    off = abs(told["nearest"]["tail_error_ms"])
+    assert f"Of the {family} distribution p99.9 is {off:.3g} ms too small: the tail does not hold." in late.caption
+    assert off > 15
+    assert "does not hold" not in even.caption
+    assert made.summary["streams"][1]["fit"]["tail_holds"]
 
 
 def test_windows_are_the_summarys() -> None:

@@ -33,6 +33,8 @@ class Made:
     spread_ms: float = 2.0
     loss: float = 0.0
     copies: float = 0.0
+    late: float = 0.0
+    """The share of the frames that come 30 ms later than that."""
     outage_s: tuple[float, float] | None = None
     behind_s: float = 0.0
     """Its clock is so far behind: so are its stamps."""
@@ -52,6 +54,8 @@ class Made:
         slot = slot[kept]
         delay = self.delay_ms + draw.gamma(2.0, self.spread_ms / 2, len(slot)) if self.spread_ms else self.delay_ms
         delay = np.broadcast_to(delay, len(slot))
+        if self.late:
+            delay = delay + 30.0 * (draw.random(len(slot)) < self.late)
         again = np.flatnonzero(draw.random(len(slot)) < self.copies)
         slot, delay = np.concatenate((slot, slot[again])), np.concatenate((delay, delay[again] + 1.0))
         of = config(self.rate, idcode)

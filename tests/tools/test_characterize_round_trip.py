@@ -18,6 +18,8 @@ from support.recordings import write
 from pmutools.c37118 import Frame, Message
 from pmutools.flow import StampSource
 from pmutools.impair.profile import read_profile_file
+from pmutools.measure.histogram import Histogram
+from pmutools.measure.likeness import allowed
 
 COUNT = 1200
 RNG = np.random.default_rng(7)
@@ -39,8 +41,13 @@ NETWORKS: dict[str, Floats] = {
     "lognormal": 10 + RNG.lognormal(1.0, 0.6, COUNT),
     "two routes": np.where(RNG.random(COUNT) < 0.3, 60.0, 40.0) + RNG.normal(0, 0.8, COUNT),
     "correlated": correlated(0.8),
+    "late": 40 + 1.3 * RNG.normal(size=COUNT) + 30 * (np.arange(COUNT) % 40 == 7),
 }
 """Delays of the first transmissions."""
+
+
+def histogram(delays: Floats) -> Histogram:
+    return Histogram(np.rint(delays * MS).astype(np.int64))
 
 
 def characterized(path: Path, out: Path, *options: object) -> tuple[dict[str, Any], Floats]:
@@ -78,6 +85,8 @@ def test_the_same_distribution_losses_and_correlation(network: str, exact: bool,
 
     assert ks_2samp(first, second).pvalue > 0.001
     assert abs(np.median(first) - np.median(second)) < 0.5
+    for held, found in zip(*(allowed(histogram(each)) for each in (first, second)), strict=True):
+        assert held.low <= found.high and found.low <= held.high, held.at
     losses = [found["lost"] / found["expected"] for found in (before, after)]
     assert losses[1] == pytest.approx(losses[0], rel=0.6)
     assert after["loss_runs"]["mean"] == pytest.approx(before["loss_runs"]["mean"], rel=0.4)
