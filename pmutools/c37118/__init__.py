@@ -14,10 +14,10 @@ from pmutools.c37118.config import (
     Station,
     StationDetails,
     StreamConfig,
-    as_kind,
     decode_config,
     encode_config,
 )
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import Command, Format, FrameType, Stat
 from pmutools.c37118.demux import Demux, Loss, Message
 from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason

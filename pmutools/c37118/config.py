@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate
 from typing import Literal, NamedTuple
 
 from pmutools.c37118.checksum import sealed
+from pmutools.c37118.config_names import encode_name2, encode_name3, name2, name3, named
 from pmutools.c37118.constants import (
     CHK_SIZE,
     FNOM_50_HZ,
@@ -251,94 +252,6 @@ def encode_config(config: StreamConfig, *, soc: int = 0, fracsec: int = 0, time_
     return sealed(encode_prefix(Prefix(sync, size, config.idcode, soc, time_quality, fracsec)) + config.body)
 
 
-def as_kind(config: StreamConfig, kind: FrameType) -> StreamConfig:
-    """The same stream described by another frame type.
-
-    CFG-3 gets scales that give the values CFG-2 gives, CFG-2 the nearest PHUNIT and names cut to 16 bytes. Analog
-    scaling of CFG-3 has no place in CFG-2 and is lost.
-    """
-    if (kind is FrameType.CFG3) == (config.kind is FrameType.CFG3):
-        return replace(config, kind=kind, version=kind.version)
-    convert = _station_to_3 if kind is FrameType.CFG3 else _station_to_2
-    return replace(
-        config, kind=kind, version=kind.version, stations=tuple(convert(station) for station in config.stations)
-    )
-
-
-def abridges(short: StreamConfig, full: StreamConfig) -> bool:
-    """Whether a CFG-2 says of a stream what a CFG-3 says, as far as it can: a device may send it unasked, now and then.
-
-    Units and digital masks, which devices fill in each in its own way, are not compared; PHUNIT is where it counts.
-    """
-    if (short.kind, full.kind, short.idcode) != (FrameType.CFG2, FrameType.CFG3, full.idcode):
-        return False
-    cut = as_kind(full, FrameType.CFG2)
-    return _gist(short) == _gist(cut) and all(
-        abs(said.phunit - known.phunit) <= 1
-        for ours, theirs in zip(short.stations, cut.stations, strict=True)
-        for said, known in zip(ours.phasors, theirs.phasors, strict=True)
-        if not ours.format & Format.PHASOR_FLOAT
-    )
-
-
-def _gist(config: StreamConfig) -> tuple[object, ...]:
-    names = [
-        (
-            (station.name, station.idcode, station.format, station.fnom, station.cfgcnt),
-            *(channel.name for channel in station.phasors),
-            *(channel.name for channel in station.analogs),
-            *(word.labels for word in station.digitals),
-        )
-        for station in config.stations
-    ]
-    return config.time_base, config.data_rate, [len(station.phasors) for station in config.stations], names
-
-
-# --- names ------------------------------------------------------------------------------------------------------
-
-_PAD = " \0"
-
-
-def _decode_name(raw: bytes) -> str:
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    return text.rstrip(_PAD)
-
-
-def _name2(name: str) -> bytes:
-    raw = name.encode("utf-8")
-    if len(raw) > NAME_SIZE:
-        raise EncodeError(f"name {name!r} takes {len(raw)} bytes, CFG-1 and CFG-2 have {NAME_SIZE}")
-    return raw.ljust(NAME_SIZE)
-
-
-def _name3(name: str) -> bytes:
-    raw = name.encode("utf-8")
-    if len(raw) > 0xFF:
-        raise EncodeError(f"name {name[:20]!r}... takes {len(raw)} bytes, CFG-3 has 255")
-    return raw
-
-
-def _encode_name2(name: str, wire_name: bytes | None) -> bytes:
-    return _name2(name) if wire_name is None else wire_name
-
-
-def _encode_name3(name: str, wire_name: bytes | None) -> bytes:
-    raw = _name3(name) if wire_name is None else wire_name
-    return bytes((len(raw),)) + raw
-
-
-def _named(raw: bytes, canonical: Callable[[str], bytes]) -> tuple[str, bytes | None]:
-    """A name, and its bytes where encoding the name would not give them back."""
-    name = _decode_name(raw)
-    try:
-        return name, None if canonical(name) == raw else raw
-    except EncodeError:  # latin-1 text that grows in UTF-8
-        return name, raw
-
-
 # --- reading ----------------------------------------------------------------------------------------------------
 
 _U16 = struct.Struct(">H")
@@ -368,10 +281,10 @@ class _Reader:
         return layout.unpack(self.take(layout.size))
 
     def name2(self) -> tuple[str, bytes | None]:
-        return _named(self.take(NAME_SIZE), _name2)
+        return named(self.take(NAME_SIZE), name2)
 
     def name3(self) -> tuple[str, bytes | None]:
-        return _named(self.take(self.take(1)[0]), _name3)
+        return named(self.take(self.take(1)[0]), name3)
 
 
 def _read_station2(reader: _Reader) -> Station:
@@ -467,9 +380,9 @@ def _masks(station: Station) -> bytes:
 def _write_station2(station: Station) -> bytes:
     return b"".join(
         (
-            _encode_name2(station.name, station.wire_name),
+            encode_name2(station.name, station.wire_name),
             _BLOCK.pack(station.idcode, station.format, *_counts(station)),
-            _labels(station, _encode_name2),
+            _labels(station, encode_name2),
             struct.pack(f">{len(station.phasors)}I", *(channel.phunit for channel in station.phasors)),
             struct.pack(f">{len(station.analogs)}I", *(channel.anunit for channel in station.analogs)),
             _masks(station),
@@ -484,12 +397,12 @@ def _write_station3(station: Station) -> bytes:
         raise EncodeError(f"station {station.name!r}: G_PMU_ID has {len(details.g_pmu_id)} bytes, not 16")
     return b"".join(
         (
-            _encode_name3(station.name, station.wire_name),
+            encode_name3(station.name, station.wire_name),
             _U16.pack(station.idcode),
             details.g_pmu_id,
             struct.pack(">HHHH", station.format, *_counts(station)),
-            _labels(station, _encode_name3),
-            *(_PHSCALE.pack(*(channel.phscale or _scale_of(channel, station.format))) for channel in station.phasors),
+            _labels(station, encode_name3),
+            *(_PHSCALE.pack(*(channel.phscale or scale_of(channel, station.format))) for channel in station.phasors),
             *(_ANSCALE.pack(*(channel.anscale or AnalogScale(1.0, 0.0))) for channel in station.analogs),
             _masks(station),
             _DETAILS.pack(
@@ -505,46 +418,8 @@ def _write_station3(station: Station) -> bytes:
     )
 
 
-# --- CFG-2 <-> CFG-3 --------------------------------------------------------------------------------------------
-
-
-def _scale_of(channel: PhasorChannel, fmt: Format) -> PhasorScale:
+def scale_of(channel: PhasorChannel, fmt: Format) -> PhasorScale:
+    """PHSCALE of a channel that has none: as CFG-2 scales it."""
     current = PHSCALE_CURRENT if channel.kind == "I" else 0
     scale = 1.0 if fmt & Format.PHASOR_FLOAT else channel.unit
     return PhasorScale(0, current | 1, 0, scale, 0.0)
-
-
-def _station_to_3(station: Station) -> Station:
-    return replace(
-        station,
-        wire_name=None,
-        phasors=tuple(PhasorChannel(c.name, c.phunit, _scale_of(c, station.format)) for c in station.phasors),
-        analogs=tuple(AnalogChannel(c.name, c.anunit, AnalogScale(1.0, 0.0)) for c in station.analogs),
-        digitals=tuple(DigitalWord(w.labels, w.normal, w.valid) for w in station.digitals),
-        details=station.details or StationDetails(),
-    )
-
-
-def cut_name(name: str, size: int = NAME_SIZE) -> str:
-    """``name`` cut to ``size`` bytes of UTF-8, at a character's end."""
-    return name.encode("utf-8")[:size].decode("utf-8", "ignore").rstrip()
-
-
-def _station_to_2(station: Station) -> Station:
-    def phasor(channel: PhasorChannel) -> PhasorChannel:
-        current = (channel.kind == "I") << 24
-        scale = channel.phscale.scale if channel.phscale else 0.0
-        count = round(scale * 1e5) if scale == scale and abs(scale) < 1e9 else 0
-        return PhasorChannel(cut_name(channel.name), current | min(max(count, 0), 0xFFFFFF))
-
-    return replace(
-        station,
-        name=cut_name(station.name),
-        wire_name=None,
-        phasors=tuple(phasor(channel) for channel in station.phasors),
-        analogs=tuple(AnalogChannel(cut_name(c.name), c.anunit) for c in station.analogs),
-        digitals=tuple(
-            DigitalWord(tuple(cut_name(label) for label in w.labels), w.normal, w.valid) for w in station.digitals
-        ),
-        details=None,
-    )

@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from pmutools.c37118.checksum import chk_array
-from pmutools.c37118.config import StreamConfig, abridges, decode_config, decode_config_body
+from pmutools.c37118.config import StreamConfig, decode_config, decode_config_body
+from pmutools.c37118.config_kinds import abridges
 from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
 from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason
 from pmutools.c37118.prefix import decode_prefix

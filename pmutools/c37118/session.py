@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from pmutools.c37118.config import StreamConfig, as_kind, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.frames import decode_command, encode_command, encode_header, restamp
 from pmutools.errors import WireError

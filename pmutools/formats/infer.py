@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.c37118.config import AnalogChannel, DigitalWord, PhasorChannel, Station, StreamConfig, cut_name
+from pmutools.c37118.config import AnalogChannel, DigitalWord, PhasorChannel, Station, StreamConfig
+from pmutools.c37118.config_kinds import cut_name
 from pmutools.c37118.constants import FNOM_50_HZ, LABELS_PER_WORD, MAX_FRAME_SIZE, NAME_SIZE, Format
 from pmutools.errors import SourceError
 from pmutools.formats.columns import FRAME_COLUMNS, Column

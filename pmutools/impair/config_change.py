@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple, Protocol
 
-from pmutools.c37118.config import AnalogChannel, Station, StreamConfig, as_kind, encode_config
+from pmutools.c37118.config import AnalogChannel, Station, StreamConfig, encode_config
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import CHK_SIZE, MAX_FRAME_SIZE, Format, FrameType, Stat
 from pmutools.c37118.layout import layout_of
 from pmutools.c37118.prefix import decode_prefix

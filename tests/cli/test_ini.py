@@ -21,7 +21,7 @@ from support.peers import free_port, pyc37_stream, start_pyc37_pmu
 from support.playing import START_NS, recording, stream
 
 from pmutools.c37118 import Format, PhasorChannel, Station, StreamConfig, decode_config, encode_config
-from pmutools.c37118.config import cut_name
+from pmutools.c37118.config_kinds import cut_name
 from pmutools.cli.ini_text import Section, ini_text, sections_of
 from pmutools.clock import SystemClock
 from pmutools.flow import Flow

@@ -15,7 +15,7 @@ from support.recordings import blocks_of, data_of, read
 
 from pmutools.c37118 import FrameType, decode_config
 from pmutools.c37118.batch import Batch
-from pmutools.c37118.config import as_kind
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.session import served
 from pmutools.errors import PmuError, SettingsError, SourceError
 from pmutools.formats import open_sink, open_source

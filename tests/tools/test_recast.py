@@ -18,7 +18,8 @@ from pmutools import timebase
 from pmutools.c37118 import FrameType, Message, StreamConfig, decode_config
 from pmutools.c37118.batch import NO_TIME, Batch, decode_batch
 from pmutools.c37118.checksum import chk_array
-from pmutools.c37118.config import as_kind, encode_config
+from pmutools.c37118.config import encode_config
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import Format
 from pmutools.c37118.demux import Demux, Loss
 from pmutools.c37118.session import served

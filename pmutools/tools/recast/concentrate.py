@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from pmutools import timebase
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch, decode_batch, encode_batch
-from pmutools.c37118.config import StreamConfig, as_kind, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import (
     CHK_SIZE,
     FIRST_IDCODE,
