@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from support.controlled import FakePlayer
-from support.terminals import ENVIRONMENT, Screen, fcntl, pty, resize, termios
+from support.terminals import ENVIRONMENT, Terminal, fcntl, pty, resize, termios
 
 from pmutools.cli.play_display import Display
 from pmutools.cli.play_screen import Title
@@ -30,15 +30,12 @@ MS = 1_000_000
 ROOT = Path(__file__).parents[2]
 
 
-class Stage:
-    """A display on a pseudo terminal whose other end is here."""
+class Stage(Terminal):
+    """A display on a pseudo terminal."""
 
     def __init__(self, streams: int = 8, environment: dict[str, str] | None = None) -> None:
-        self.master, self.slave = pty.openpty()
-        resize(self.slave, 80, 24)
-        os.set_blocking(self.master, False)
-        self.before = termios.tcgetattr(self.slave)
-        self.player, self.reactor, self.screen = FakePlayer(streams), Reactor(SystemClock()), Screen()
+        super().__init__()
+        self.player, self.reactor = FakePlayer(streams), Reactor(SystemClock())
         self.display = Display(
             self.player,
             self.reactor,
@@ -48,26 +45,11 @@ class Stage:
             environment=environment or ENVIRONMENT,
         )
 
-    def run_until(self, done: Callable[[], bool], limit_s: float = 10) -> None:
-        end = time.monotonic() + limit_s
-        while not done():
-            assert time.monotonic() < end, self.screen.lines
-            self.reactor.run(5 * MS)
-            self.hear()
-
-    def hear(self) -> None:
-        while True:
-            try:
-                self.screen.hear(os.read(self.master, 1 << 16))
-            except OSError:
-                return
-
-    def type(self, data: bytes) -> None:
-        os.write(self.master, data)
+    def until(self, done: Callable[[], bool], limit_s: float = 10) -> None:
+        self.run_until(done, lambda: self.reactor.run(5 * MS), limit_s)
 
     def close(self) -> None:
-        os.close(self.slave)
-        os.close(self.master)
+        super().close()
         self.reactor.close()
 
 
@@ -84,35 +66,35 @@ def stage(streams: int = 8, environment: dict[str, str] | None = None) -> Iterat
 
 def test_keys_reach_the_player_and_the_screen_follows() -> None:
     with stage() as on:
-        on.run_until(lambda: "PLAYING" in on.screen)
+        on.until(lambda: "PLAYING" in on.shown)
         on.type(b" ")
-        on.run_until(lambda: "PAUSED" in on.screen)
+        on.until(lambda: "PAUSED" in on.shown)
         on.type(b"\x1b[C")
-        on.run_until(lambda: on.player.done == ["pause", "step"])
+        on.until(lambda: on.player.done == ["pause", "step"])
         on.type(b"]]]")
-        on.run_until(lambda: len(on.player.done) == 5)
+        on.until(lambda: len(on.player.done) == 5)
         assert on.player.done[2:] == ["seek 13.5", "seek 14.5", "seek 15.5"]
         on.type(b"nf")
-        on.run_until(lambda: "fault of N2:" in on.screen)
+        on.until(lambda: "fault of N2:" in on.shown)
         on.type(b"loss=5%\r")
-        on.run_until(lambda: on.player.done[-1] == "fault N2")
+        on.until(lambda: on.player.done[-1] == "fault N2")
         on.type(b":enable N9\r")
-        on.run_until(lambda: "enable N9: no such stream" in on.screen)
+        on.until(lambda: "enable N9: no such stream" in on.shown)
         on.display.note("127.0.0.1:5000 started 101")
-        on.run_until(lambda: "127.0.0.1:5000 started 101" in on.screen)
+        on.until(lambda: "127.0.0.1:5000 started 101" in on.shown)
         resize(on.slave, 120, 40)
-        on.run_until(lambda: 40 in on.screen.lines)
+        on.until(lambda: 40 in on.shown.lines)
         on.type(b"q")
-        on.run_until(lambda: on.display.quit)
+        on.until(lambda: on.display.quit)
 
 
 def test_escape_alone_leaves_a_prompt() -> None:
     with stage() as on:
-        on.run_until(lambda: "PLAYING" in on.screen)
+        on.until(lambda: "PLAYING" in on.shown)
         on.type(b":x")
-        on.run_until(lambda: on.display.ui.prompt is not None)
+        on.until(lambda: on.display.ui.prompt is not None)
         on.type(b"\x1b")
-        on.run_until(lambda: on.display.ui.prompt is None)
+        on.until(lambda: on.display.ui.prompt is None)
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt, RuntimeError])
@@ -121,7 +103,7 @@ def test_the_terminal_is_set_back(error: type[BaseException] | None) -> None:
     on = Stage()
     try:
         with on.display:
-            on.run_until(lambda: "PLAYING" in on.screen)
+            on.until(lambda: "PLAYING" in on.shown)
             assert not termios.tcgetattr(on.slave)[3] & (termios.ECHO | termios.ICANON)
             if error is not None:
                 raise error
@@ -129,7 +111,7 @@ def test_the_terminal_is_set_back(error: type[BaseException] | None) -> None:
         pass
     assert termios.tcgetattr(on.slave) == on.before
     on.hear()
-    assert on.screen.raw.endswith(b"\x1b[?25h\x1b[?1049l")
+    assert on.shown.raw.endswith(b"\x1b[?25h\x1b[?1049l")
     assert [signal.getsignal(number) for number in (signal.SIGTSTP, signal.SIGCONT, signal.SIGHUP)] == handlers
     on.close()
 
@@ -154,7 +136,7 @@ def test_a_terminal_that_takes_nothing_holds_up_nothing() -> None:
 def test_a_terminal_that_is_gone_ends_the_player() -> None:
     on = Stage()
     with on.display:
-        on.run_until(lambda: "PLAYING" in on.screen)
+        on.until(lambda: "PLAYING" in on.shown)
         os.close(on.master)
         end = time.monotonic() + 5
         while not on.display.quit:
@@ -183,18 +165,17 @@ def test_a_pipe_is_no_terminal() -> None:
 @pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("LANG", "C")])
 def test_poor_terminals(name: str, value: str) -> None:
     with stage(environment=ENVIRONMENT | {name: value}) as on:
-        on.run_until(lambda: "PLAYING" in on.screen and 24 in on.screen.lines)
+        on.until(lambda: "PLAYING" in on.shown and 24 in on.shown.lines)
         if name == "NO_COLOR":
-            assert not re.search(rb"\x1b\[[\d;]*3\dm", on.screen.raw)
+            assert not re.search(rb"\x1b\[[\d;]*3\dm", on.shown.raw)
         else:
-            assert on.screen.raw.isascii()
+            assert on.shown.raw.isascii()
 
 
 CHILD = """
 import os, signal, sys
 sys.path[:0] = [{root!r}, {tests!r}]
 from support.controlled import FakePlayer
-from support.terminals import ENVIRONMENT, Screen, fcntl, pty, resize, termios
 from pmutools.cli.play_display import Display
 from pmutools.cli.play_screen import Title
 from pmutools.clock import SystemClock

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from support.commands import command, started
 from support.live import free_udp_port
-from support.terminals import ENVIRONMENT, Screen, fcntl, pty, resize, termios
+from support.terminals import ENVIRONMENT, Screen, Terminal, fcntl, pty, resize, termios
 from support.watched import ROUND_NS, watched
 
 from pmutools.cli.herald import Herald
@@ -32,42 +32,24 @@ pytestmark = pytest.mark.realtime
 LIMIT_S = 20
 
 
-class Stage:
-    """A display on a pseudo terminal whose other end is here."""
+class Stage(Terminal):
+    """A display on a pseudo terminal."""
 
     def __init__(self, watch: Watch | None = None, **options: Any) -> None:
-        self.master, self.slave = pty.openpty()
-        resize(self.slave, 80, 24)
-        os.set_blocking(self.master, False)
-        self.before = termios.tcgetattr(self.slave)
-        self.watch, self.now_ns, self.terminal = watch or watched(), 60 * ROUND_NS, Screen()
+        super().__init__()
+        self.watch, self.now_ns = watch or watched(), 60 * ROUND_NS
         environment = options.pop("environment", ENVIRONMENT)
         self.screen = WatchScreen(
             title="pmu read x.csv", keyboard=self.slave, screen=self.slave, environment=environment, **options
         )
 
-    def run_until(self, done: Callable[[], bool]) -> None:
-        end = time.monotonic() + LIMIT_S
-        while not done():
-            assert time.monotonic() < end, self.terminal.lines
-            self.now_ns += UPDATE_NS
-            self.screen.update(self.watch, self.now_ns, ("x.csv 1.0 MB",))
-            self.hear()
-            time.sleep(0.01)
+    def until(self, done: Callable[[], bool]) -> None:
+        self.run_until(done, self.update, LIMIT_S)
 
-    def hear(self) -> None:
-        while True:
-            try:
-                self.terminal.hear(os.read(self.master, 1 << 16))
-            except OSError:
-                return
-
-    def type(self, data: bytes) -> None:
-        os.write(self.master, data)
-
-    def close(self) -> None:
-        os.close(self.slave)
-        os.close(self.master)
+    def update(self) -> None:
+        self.now_ns += UPDATE_NS
+        self.screen.update(self.watch, self.now_ns, ("x.csv 1.0 MB",))
+        time.sleep(0.01)
 
 
 @contextmanager
@@ -83,45 +65,45 @@ def stage(**options: Any) -> Iterator[Stage]:
 
 def test_keys_are_heard_and_the_screen_follows() -> None:
     with stage() as on:
-        on.run_until(lambda: "7 of 8 streaming" in on.terminal and "x.csv 1.0 MB" in on.terminal)
+        on.until(lambda: "7 of 8 streaming" in on.shown and "x.csv 1.0 MB" in on.shown)
         on.type(b"v")
-        on.run_until(lambda: "cmpl%" in on.terminal)
+        on.until(lambda: "cmpl%" in on.shown)
         on.type(b"/s1")
-        on.run_until(lambda: "filter: s1" in on.terminal and "1-1 of 1" in on.terminal)
+        on.until(lambda: "filter: s1" in on.shown and "1-1 of 1" in on.shown)
         on.type(b"\r\x1b")
-        on.run_until(lambda: "1-8 of 8" in on.terminal)
+        on.until(lambda: "1-8 of 8" in on.shown)
         on.type(b"w")
-        on.run_until(lambda: "by worst" in on.terminal)
+        on.until(lambda: "by worst" in on.shown)
         on.type(b" ")
-        on.run_until(lambda: "FROZEN" in on.terminal)
+        on.until(lambda: "FROZEN" in on.shown)
         on.type(b" ?")
-        on.run_until(lambda: "any key goes back" in on.terminal)
+        on.until(lambda: "any key goes back" in on.shown)
         on.type(b"x")
         on.screen.note("udp://x bound")
-        on.run_until(lambda: "udp://x bound" in on.terminal)
+        on.until(lambda: "udp://x bound" in on.shown)
         resize(on.slave, 120, 40)
-        on.run_until(lambda: 40 in on.terminal.lines)
+        on.until(lambda: 40 in on.shown.lines)
         assert not on.screen.quit_asked
         on.type(b"q")
-        on.run_until(lambda: on.screen.quit_asked)
+        on.until(lambda: on.screen.quit_asked)
 
 
 def test_what_is_frozen_stands_still() -> None:
     with stage(watch=watched(8, 20)) as on:
-        on.run_until(lambda: "LIVE" in on.terminal)
+        on.until(lambda: "LIVE" in on.shown)
         on.type(b" ")
-        on.run_until(lambda: "FROZEN" in on.terminal)
-        held = dict(on.terminal.lines)
+        on.until(lambda: "FROZEN" in on.shown)
+        held = dict(on.shown.lines)
         on.watch.frames += 10**6
         on.watch.own_drops = 77
         for _ in range(5):
-            on.run_until(lambda: True)
+            on.until(lambda: True)
             on.now_ns += UPDATE_NS
             on.screen.update(on.watch, on.now_ns)
         on.hear()
-        assert on.terminal.lines[2] == held[2]
+        assert on.shown.lines[2] == held[2]
         on.type(b" ")
-        on.run_until(lambda: "own drops 77" in on.terminal)
+        on.until(lambda: "own drops 77" in on.shown)
 
 
 def test_a_programs_own_key() -> None:
@@ -134,13 +116,13 @@ def test_a_programs_own_key() -> None:
         return "60 s written"
 
     with stage(commands=[Command("t", "t trigger", "Write.", trigger)]) as on:
-        on.run_until(lambda: "t trigger" in on.terminal)
+        on.until(lambda: "t trigger" in on.shown)
         on.type(b"t")
-        on.run_until(lambda: "60 s written" in on.terminal)
+        on.until(lambda: "60 s written" in on.shown)
         on.type(b"t")
-        on.run_until(lambda: "the buffer is empty" in on.terminal)
+        on.until(lambda: "the buffer is empty" in on.shown)
         on.type(b"/t")
-        on.run_until(lambda: "filter: t" in on.terminal)
+        on.until(lambda: "filter: t" in on.shown)
 
 
 def test_keys_come_from_a_reactor_too() -> None:
@@ -149,7 +131,7 @@ def test_keys_come_from_a_reactor_too() -> None:
         on.screen.update(on.watch, on.now_ns)
         on.type(b"v")
         end = time.monotonic() + LIMIT_S
-        while "cmpl%" not in on.terminal:
+        while "cmpl%" not in on.shown:
             assert time.monotonic() < end
             reactor.run(20_000_000)
             on.hear()
@@ -162,7 +144,7 @@ def test_the_terminal_is_set_back(error: type[BaseException] | None) -> None:
     on = Stage()
     try:
         with on.screen:
-            on.run_until(lambda: "LIVE" in on.terminal)
+            on.until(lambda: "LIVE" in on.shown)
             assert not termios.tcgetattr(on.slave)[3] & (termios.ECHO | termios.ICANON)
             if error is not None:
                 raise error
@@ -170,7 +152,7 @@ def test_the_terminal_is_set_back(error: type[BaseException] | None) -> None:
         pass
     assert termios.tcgetattr(on.slave) == on.before
     on.hear()
-    assert on.terminal.raw.endswith(b"\x1b[?25h\x1b[?1049l")
+    assert on.shown.raw.endswith(b"\x1b[?25h\x1b[?1049l")
     assert [signal.getsignal(number) for number in (signal.SIGTSTP, signal.SIGCONT, signal.SIGHUP)] == handlers
     on.close()
 
@@ -195,7 +177,7 @@ def test_a_terminal_that_takes_nothing_holds_up_nothing() -> None:
 def test_a_terminal_that_is_gone_ends_it() -> None:
     on = Stage()
     with on.screen:
-        on.run_until(lambda: "LIVE" in on.terminal)
+        on.until(lambda: "LIVE" in on.shown)
         os.close(on.master)
         end = time.monotonic() + LIMIT_S
         while not on.screen.quit_asked:
@@ -208,9 +190,9 @@ def test_a_terminal_that_is_gone_ends_it() -> None:
 
 def test_without_utf_8_and_colour() -> None:
     with stage(environment={"TERM": "xterm", "LANG": "C", "NO_COLOR": "1"}) as on:
-        on.run_until(lambda: "7 of 8 streaming" in on.terminal)
-        assert on.terminal.raw.isascii()
-        assert b"\x1b[31m" not in on.terminal.raw
+        on.until(lambda: "7 of 8 streaming" in on.shown)
+        assert on.shown.raw.isascii()
+        assert b"\x1b[31m" not in on.shown.raw
 
 
 def test_without_a_terminal_there_is_a_line_where_someone_sees_it(
