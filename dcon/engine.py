@@ -113,7 +113,10 @@ class Engine:
         for name, arrived in frames.items():
             binding, index = self.bindings.get(name), self._index.get(name)
             for frame in arrived:
-                read = None if binding is None else _read(binding, frame)
+                try:
+                    read = None if binding is None else binding.read(frame)
+                except WireError:
+                    read = None
                 if read is not None and index is not None:
                     samples[index].append(read.sample)
                     readings.append(read)
@@ -129,10 +132,3 @@ class Engine:
             record = record._replace(events=(*self._notes, *record.events))
             self._notes = []
         return Tick(record, tuple(readings), surroundings)
-
-
-def _read(binding: Binding, frame: Frame) -> Reading | None:
-    try:
-        return binding.read(frame)
-    except WireError:
-        return None

@@ -37,11 +37,12 @@ class Binding:
 
     def read(self, frame: Frame) -> Reading | None:
         """A data frame as the controller sees it; None where it is not of this configuration."""
-        layout = self.layout
-        if len(frame.data) != layout.frame_size:
+        layout, station = self.layout, self.station
+        wire, arrival_ns, _, _ = frame
+        if len(wire) != layout.frame_size:
             return None
-        data = unpack_data(frame.data, self.config, layout)
-        time_ns, arrival_ns = data.time_ns, frame.arrival_ns
+        data = unpack_data(wire, self.config, layout)
+        time_ns = data.time_ns
         v1, v2 = self._voltages(data)
         sample = _new(
             Sample,
@@ -49,8 +50,8 @@ class Binding:
                 time_ns,
                 time_ns if arrival_ns is None else arrival_ns,
                 v1,
-                data.frequency(self.station),
-                data.stat(self.station),
+                data.frequency(station),
+                data.stat(station),
                 data.time_quality,
                 layout.time_base,
                 v2,
@@ -60,7 +61,9 @@ class Binding:
 
     def _voltages(self, data: Data) -> tuple[complex, complex]:
         """Positive- and negative-sequence voltage, V RMS; the latter NaN where the phases are not given."""
-        phasors = _polar(data, self.places) or list(map(data.phasor, self.voltage))
+        if len(self.places) == 3 and (phases := _three_polar(data.values, *self.places)) is not None:
+            return sequences(*phases)
+        phasors = list(map(data.phasor, self.voltage))
         return sequences(*phasors) if len(phasors) == 3 else (phasors[0], _ABSENT)
 
     def reads_like(self, other: Binding) -> bool:
@@ -102,14 +105,14 @@ class Reading(NamedTuple):
         return pmu_frame(name, self.frame, self.data, station=station, v1=self.sample.v1)
 
 
-def _polar(data: Data, places: Sequence[int]) -> list[complex]:
-    """Phasors that are polar floats, as ``data.phasor`` gives them; none where one is 0 or not finite: that decides."""
-    values, rect = data.values, cmath.rect
+def _three_polar(values: Sequence[float], a: int, b: int, c: int) -> tuple[complex, complex, complex] | None:
+    """Phasors that are polar floats, as ``data.phasor`` gives them; None where one is 0 or not finite: that decides."""
+    rect = cmath.rect
     try:
-        phasors = [rect(values[place], values[place + 1]) for place in places]
+        va, vb, vc = rect(values[a], values[a + 1]), rect(values[b], values[b + 1]), rect(values[c], values[c + 1])
     except ValueError:  # an infinite angle
-        return []
-    return phasors if all(phasors) and cmath.isfinite(sum(phasors)) else []
+        return None
+    return (va, vb, vc) if va and vb and vc and cmath.isfinite(va + vb + vc) else None
 
 
 def _meaning(layout: Layout) -> tuple[object, ...]:

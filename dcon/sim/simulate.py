@@ -6,9 +6,9 @@ Only clocks and sockets are missing. A run is a function of its plan.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
 from dcon.sim.operator import EagerOperator
 from dcon.sim.plan import START_NS, Plan, ini_of
+from dcon.sim.wire import Wire
 from pmutools import timebase
 from pmutools.c37118 import Frame
 from pmutools.errors import SettingsError
@@ -92,6 +93,7 @@ class _Sender:
     def __init__(self, pmu: PmuModel, plan: Plan, profile: Profile) -> None:
         self.pmu = pmu
         self.stream = EmulatedStream([pmu], plan.rate_hz)
+        self.wire = Wire(pmu.name, self.stream.config)
         names = (str(pmu.idcode), pmu.bus)
         self.pipeline = Pipeline(profile, pmu.name, plan.seed, config=self.stream.config, aliases=names)
 
@@ -111,6 +113,10 @@ def settings_of(plan: Plan, pmus: Sequence[PmuModel]) -> Settings:
 
 
 Tell = Callable[[float], None]
+Arrival = tuple[int, int, Wire, bytes]
+"""When a datagram arrives, its number, where, and what it holds."""
+_SENT, _CAPTURE = Fate.SENT, StampSource.CAPTURE  # looking a member up takes longer than comparing it
+_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 TOLD_TICKS = 600
 SCHEDULE_MW = 2000.0
 """Of the DC line, north to south; assumed, and without effect on the plants that there are."""
@@ -178,7 +184,7 @@ def _run(
     probe_s = split.start_s if split.section else None
     operator = EagerOperator(Mode.CLOSED_LOOP if plan.control else Mode.OPEN_LOOP, probe_s)
     operated = plan.control or probe_s is not None
-    arrivals: list[tuple[int, int, str, bytes]] = []
+    arrivals: list[Arrival] = []
     order = 0
     end_ns = START_NS + round(plan.length_s * timebase.NS)
     stamps = _stamps(plan)
@@ -189,10 +195,7 @@ def _run(
         while next_stamp <= tick_ns and next_stamp < end_ns:
             order = _measure(grid, senders, next_stamp, slot, outcome, arrivals, order)
             next_stamp, slot = next(stamps), slot + 1
-        frames: dict[str, list[Frame]] = {}
-        while arrivals and arrivals[0][0] <= tick_ns:
-            arrival_ns, _, name, data = heapq.heappop(arrivals)
-            frames.setdefault(name, []).append(Frame(data, arrival_ns, StampSource.CAPTURE, 0))
+        frames = _arrived(arrivals, tick_ns, engine, log)
         orders = operator.orders(engine.state.system, (tick_ns - START_NS) / timebase.NS) if operated else ()
         tick = engine.tick(frames, orders, tick_ns)
         grid.command(tick.record.output_v * MW_PER_V, tick_ns)
@@ -201,6 +204,26 @@ def _run(
             tell(outcome.tick_s[-1])
         if log is not None:
             log.tick(tick.record, tick.readings, orders, pdci=_line(grid, tick_ns), surroundings=tick.surroundings)
+
+
+def _arrived(
+    arrivals: list[Arrival], tick_ns: int, engine: Engine, log: SessionWriter | None
+) -> dict[str, list[Frame]]:
+    """Data frames that have come by a tick, by PMU; a configuration among them is in force for those after it."""
+    frames: dict[str, list[Frame]] = {}
+    while arrivals and arrivals[0][0] <= tick_ns:
+        arrival_ns, _, wire, data = heappop(arrivals)
+        if wire.is_plain(data):
+            frames.setdefault(wire.name, []).append(_new(Frame, (data, arrival_ns, _CAPTURE, 0)))
+            continue
+        for frame, config in wire.frames(data, arrival_ns):
+            if config is None:
+                frames.setdefault(wire.name, []).append(frame)
+            elif engine.configs.get(wire.name) != config:
+                engine.reconfigure(wire.name, config)
+                if log is not None:
+                    log.config(wire.name, frame.data, arrival_ns)
+    return frames
 
 
 def _line(grid: Grid, tick_ns: int) -> Pdci:
@@ -226,7 +249,7 @@ def _measure(
     stamp_ns: int,
     slot: int,
     outcome: Outcome,
-    arrivals: list[tuple[int, int, str, bytes]],
+    arrivals: list[Arrival],
     order: int,
 ) -> int:
     """Move the grid to a reporting instant and send every PMU's frame; what gets through goes onto the heap.
@@ -236,11 +259,13 @@ def _measure(
     grid.advance(stamp_ns)
     buses = grid.buses()
     outcome.swing_mhz.append(_swing_mhz(buses))
+    since_ns = stamp_ns - START_NS
     for sender in senders:
-        report = measure(sender.pmu, buses, stamp_ns, slot, nominal_hz=sender.stream.nominal_hz)
-        for out in sender.pipeline.apply(slot, sender.stream.data_frame((report,)), stamp_ns - START_NS):
-            if out.fate is Fate.SENT:
-                heapq.heappush(arrivals, (START_NS + out.offset_ns, order, sender.pmu.name, out.data))
+        stream = sender.stream
+        report = measure(sender.pmu, buses, stamp_ns, slot, nominal_hz=stream.nominal_hz)
+        for out in sender.pipeline.apply(slot, stream.data_frame((report,)), since_ns):
+            if out.fate is _SENT:
+                heappush(arrivals, (START_NS + out.offset_ns, order, sender.wire, out.data))
                 order += 1
     return order
 
@@ -255,11 +280,12 @@ def _note(outcome: Outcome, record: Record) -> None:
 
 
 def _uncontrolled(plan: Plan) -> list[float]:
-    """The same grid left alone: its swing in mHz at the plan's rate."""
+    """The same grid left alone, as long as it is judged: its swing in mHz at the plan's rate."""
     grid = _grid(plan, plan.course, 0)
     swing = []
     stamps = _stamps(plan)
-    for _ in range(round(plan.length_s * plan.rate_hz)):
+    length_s = min(plan.length_s, plan.course.ringdown_s[1]) if plan.course.ringdown_s else plan.length_s
+    for _ in range(round(length_s * plan.rate_hz)):
         grid.advance(next(stamps))
         swing.append(_swing_mhz(grid.buses()))
     return swing

@@ -152,6 +152,7 @@ def run(command: click.Command, arguments: Sequence[str], *, name: str | None = 
     ``--debug`` adds the traceback, and changes nothing else.
     """
     name = name or command.name or "pmu"
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small here: a second thread spins for nothing
     signal.signal(signal.SIGTERM, _interrupt)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

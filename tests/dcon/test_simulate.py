@@ -26,6 +26,7 @@ from dcon.sim.simulate import SCHEDULE_MW, simulate
 from pmutools.cli.shell import run
 from pmutools.grid.modal import SEPARATED_FROM_ALBERTA
 from pmutools.grid.theory import closed_loop_eigenvalue, frequency_and_damping
+from pmutools.impair.profile import parse_profile
 
 Capsys = pytest.CaptureFixture[str]
 KEYS = (
@@ -199,6 +200,30 @@ def test_the_command_saturates_and_a_gain_beyond_the_operators_is_for_simulation
     assert row["gain_mw_per_mhz"] == 15.0 and over["gain_mw_per_mhz"] == 20.0
     assert over["peak_command_mw"] == 125.0
     assert over["final_state"] == "ACTIVE"
+
+
+@pytest.mark.parametrize(
+    ("fault", "loses"),
+    [
+        ("corrupt = 2% field=chk", True),
+        ("corrupt = 2%", True),
+        ("corrupt = 2% field=sync", True),
+        ("corrupt = 2% field=idcode", True),
+        ("corrupt = 2% truncate(20)", True),
+        ("corrupt = 2% field=stat chk=fix", False),
+        ("config = add(analogs=2) when=5..7", False),
+    ],
+)
+def test_what_the_wire_damages_never_reaches_the_controller(tmp_path: Path, fault: str, loses: bool) -> None:
+    """As live: a frame whose CHK fails, or that is no frame of the stream, is missing."""
+    plan = Plan(duration_s=12, profile=parse_profile(f"[stream N1]\n{fault}\n", "profile"))
+    path = tmp_path / "s.mcap"
+    outcome = simulate(plan, str(path))
+    names = {(event.name, event.subject) for _, event in outcome.events}
+    assert (("stamp_step", "N1") in names) == loses
+    again = replay(path)
+    assert again.ticks == 12 * 60
+    assert again.different == 0
 
 
 def test_bc_us_separation_gains_the_papers_damping() -> None:
