@@ -4,13 +4,15 @@ Configurations are kept per flow and IDCODE. A data frame whose flow has shown n
 the same host (commands over TCP with data over UDP) if exactly one fits by IDCODE and size. Data that comes before
 its configuration is held, at most :data:`HELD_BYTES` a stream and :data:`ALL_HELD_BYTES` in all, and given out when a
 configuration of the right frame size comes; what is still held at the end, or overflows, becomes
-``Skipped(NO_CONFIG)``: of one stream the newest frames, of all streams the one that has waited longest.
+``Skipped(NO_CONFIG)``: of one stream the oldest frames, of all streams the one that has waited longest. The frames
+come with that, in order, for who keeps bytes.
 
 A flow that never shows a good frame is not C37.118 traffic: its bytes are counted in ``ignored``, not skipped.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
@@ -55,10 +57,11 @@ class DataRun(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """Bytes of ``flow`` that are in no message."""
+    """Bytes of ``flow`` that are in no message. ``frame``: they are a data frame for which no configuration came."""
 
     skipped: Skipped
     flow: Flow
+    frame: Frame | None = None
 
 
 @dataclass
@@ -99,7 +102,7 @@ def _forget(table: dict[_Place, dict[Flow, _T]], place: _Place, flow: Flow) -> N
 
 @dataclass
 class _Held:
-    frames: list[Frame] = field(default_factory=list)
+    frames: deque[Frame] = field(default_factory=deque)
     nbytes: int = 0
 
 
@@ -353,7 +356,7 @@ class Demux:
         tally.frames[kind] = tally.frames.get(kind, 0) + 1
         out.append(message)
 
-    def _lose(self, state: _FlowState, skipped: Skipped, out: list[Message | Loss]) -> None:
+    def _lose(self, state: _FlowState, skipped: Skipped, out: list[Message | Loss], frame: Frame | None = None) -> None:
         if not state.proven:
             if state.early and len(state.early) >= 1024:  # a busy unrelated flow: keep the sum, not the list
                 last = state.early[-1]
@@ -363,7 +366,7 @@ class Demux:
             state.early_bytes += skipped.nbytes
             return
         self.tally.skipped[skipped.reason] = self.tally.skipped.get(skipped.reason, 0) + skipped.nbytes
-        out.append(Loss(skipped, state.flow))
+        out.append(Loss(skipped, state.flow, frame))
 
     def _configure(self, state: _FlowState, frame: Frame, kind: FrameType, out: list[Message | Loss]) -> None:
         config: StreamConfig | None = None
@@ -397,7 +400,7 @@ class Demux:
     def _release(self, state: _FlowState, config: StreamConfig, out: list[Message | Loss]) -> None:
         held = state.held[config.idcode]
         fitting = [frame for frame in held.frames if len(frame.data) == config.frame_size]
-        held.frames = [frame for frame in held.frames if len(frame.data) != config.frame_size]
+        held.frames = deque(frame for frame in held.frames if len(frame.data) != config.frame_size)
         held.nbytes -= len(fitting) * config.frame_size
         self._held_bytes -= len(fitting) * config.frame_size
         if not held.frames:
@@ -425,9 +428,11 @@ class Demux:
     def _hold(self, state: _FlowState, frame: Frame, out: list[Message | Loss]) -> None:
         size = len(frame.data)
         held = state.held.get(frame.idcode)
-        if held is not None and held.nbytes + size > HELD_BYTES:
-            self._drop(state, [frame], out)
-            return
+        while held is not None and held.frames and held.nbytes + size > HELD_BYTES:
+            oldest = held.frames.popleft()
+            held.nbytes -= len(oldest.data)
+            self._held_bytes -= len(oldest.data)
+            self._drop(state, [oldest], out)
         while self._waiting and self._held_bytes + size > ALL_HELD_BYTES:
             (_, idcode), flows = next(iter(self._waiting.items()))
             self._give_up(next(iter(flows.values())), idcode, out)
@@ -445,9 +450,10 @@ class Demux:
         _forget(self._waiting, (state.host, idcode), state.flow)
         self._drop(state, held.frames, out)
 
-    def _drop(self, state: _FlowState, frames: list[Frame], out: list[Message | Loss]) -> None:
+    def _drop(self, state: _FlowState, frames: Iterable[Frame], out: list[Message | Loss]) -> None:
         for frame in frames:
-            self._lose(state, Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data), frame.idcode), out)
+            skipped = Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data), frame.idcode)
+            self._lose(state, skipped, out, frame)
 
     def _join(self, state: _FlowState, frame: Frame) -> StreamConfig | None:
         """Collect CFG-3 fragments that each have their own CHK; the configuration once the last one is there.

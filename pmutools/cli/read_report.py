@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from pmutools.c37118.framer import SkipReason
 from pmutools.cli.shell import Exit, Talk
 from pmutools.errors import SourceError
 
@@ -60,21 +61,36 @@ def report(
     stopped: bool,
 ) -> int:
     paths = [str(path) for path in recorder.paths]
+    silent = [{"name": name, "why": stage.reasons.why(place)} for place, name in source.silent]
+    told = reading.to_json() | {"kept_undecoded": recorder.undecoded, "silent": silent, "paths": paths}
     if as_json and not recording.to_stdout:
-        silent = [{"name": name, "why": stage.reasons.why(place)} for place, name in source.silent]
-        click.echo(json.dumps(reading.to_json() | {"silent": silent, "paths": paths}))
+        click.echo(json.dumps(told))
     talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
     for reason, nbytes in reading.skipped.items():
-        talk.say(f"  {nbytes} bytes skipped: {reason}")
+        talk.say(f"  {_skipped(reason, nbytes, reading, recorder)}")
     for place, name in source.silent[:SHOWN_SILENT] if reading.frames else ():
         talk.say(f"  {name}: no data: {stage.reasons.why(place)}")
     if reading.own_drops:
         talk.say(f"  {reading.own_drops} datagrams lost in this machine's receive buffer, not in the network")
+    if as_json and recording.to_stdout:  # which has the data
+        click.echo(json.dumps(told), err=True)
     if stopped:
         return Exit.INTERRUPTED
     if not reading.frames and not reading.skipped:
         raise nothing_came(source, stage.reasons)
     return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
+
+
+def _skipped(reason: str, nbytes: int, reading: Reading, recorder: Recorder) -> str:
+    """Bytes that could not be decoded, and what became of frames for which only a configuration was missing."""
+    frames, kept = reading.undecoded, recorder.undecoded
+    if reason != SkipReason.NO_CONFIG or not frames:
+        return f"{nbytes} bytes skipped: {reason}"
+    fate = "not kept; a capture (.pcapng, .c37118, .mcap) keeps them undecoded"
+    if kept:
+        fate = "kept undecoded" if kept == frames else f"{kept} of them kept undecoded, the others in no event"
+    done = "undecoded" if kept else "skipped"
+    return f"{nbytes} bytes {done}: {reason}: no configuration came for {frames} frames: {fate}"
 
 
 def _paths_text(paths: Sequence[str]) -> str:

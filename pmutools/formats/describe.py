@@ -13,6 +13,7 @@ from pmutools import timebase
 from pmutools.c37118.config import AnalogChannel, PhasorChannel, Station, StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Loss, Message
+from pmutools.c37118.framer import Frame, Skipped, SkipReason
 from pmutools.c37118.frames import Data, decode_command, decode_header, unpack_data
 from pmutools.c37118.layout import layout_of
 from pmutools.c37118.prefix import Prefix, decode_prefix
@@ -31,10 +32,13 @@ def describe(item: Message | Loss) -> Json:
     """One frame, or one run of skipped bytes, as a JSON object."""
     if isinstance(item, Loss):
         reason, offset, nbytes, _ = item.skipped
-        return {"type": "skipped", "reason": str(reason), "offset": offset, "nbytes": nbytes, "flow": flow_name(item)}
+        told = {"type": "skipped", "reason": str(reason), "offset": offset, "nbytes": nbytes, "flow": flow_name(item)}
+        return told | (_undecoded(item.frame) if item.frame is not None else {})
     frame, _, config = item
-    if frame.type is FrameType.DATA:
-        assert config is not None
+    if frame.type is FrameType.DATA and config is None:
+        skipped = Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data), frame.idcode)
+        return describe(Loss(skipped, item.flow, frame))
+    if frame.type is FrameType.DATA and config is not None:
         data = unpack_data(frame.data, config, layout_of(config))
         return _head(data.prefix, item) | {"stations": _stations(data)}
     head = _head(decode_prefix(frame.data), item)
@@ -47,6 +51,17 @@ def describe(item: Message | Loss) -> Json:
     except WireError as error:
         return head | {"undecodable": str(error)}
     return head | {"command": command.name, "code": command.code, "extended": command.extended.hex()}
+
+
+def _undecoded(frame: Frame) -> Json:
+    """A whole frame that no configuration came for."""
+    source = None if frame.arrival_ns is None else str(frame.stamp_source)
+    return {
+        "idcode": frame.idcode,
+        "arrival_ns": frame.arrival_ns,
+        "stamp_source": source,
+        "wire": frame.data.hex(),
+    }
 
 
 def _head(prefix: Prefix, message: Message) -> Json:

@@ -40,7 +40,7 @@ MESSAGES: dict[str, MessageType] = {
         "/pmu/NAME/frame",
         "One data frame of one PMU, as received. Its configuration frame is an attachment that precedes it.",
         (
-            Field("time_ns", "int64", "Time of measurement, from SOC and FRACSEC.", "ns"),
+            Field("time_ns", "int64", "Time of measurement, from SOC and FRACSEC; 0 without a configuration.", "ns"),
             Field("arrival_ns", "int64", "Time of arrival; 0 where unknown.", "ns"),
             Field("tick_ns", "int64", "Control tick that consumed the frame; 0 for none.", "ns"),
             Field("stamp_source", "string", "Who took arrival_ns: hardware, kernel, kernel-batched, user, capture."),

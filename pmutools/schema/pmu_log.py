@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from pmutools.c37118 import Data, Frame, FrameType, StreamConfig, decode_config
+from pmutools.c37118.constants import PREFIX_SIZE
+from pmutools.c37118.prefix import decode_prefix
 from pmutools.errors import WireError
 from pmutools.flow import StampSource
 from pmutools.schema.descriptors import message_class
@@ -159,6 +161,13 @@ def pmu_frame(name: str, frame: Frame, data: Data, *, station: int = 0, v1: comp
         tuple(each.rocof for each in several),
         time_base=data.layout.time_base,
     )
+
+
+def undecoded_frame(name: str, frame: Frame) -> PmuFrame:
+    """A frame for which no configuration came: its bytes, and what is told without one, which the time is not."""
+    stat = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + 2], "big")
+    quality = decode_prefix(frame.data).time_quality
+    return PmuFrame(name, bytes(frame.data), 0, frame.arrival_ns, frame.stamp_source, stat, quality, _NAN, time_base=0)
 
 
 def from_message(name: str, message: Any) -> PmuFrame:

@@ -230,7 +230,22 @@ def test_data_without_a_configuration_are_told_and_are_exit_code_3(tmp_path: Pat
         result = ended(reader)
     assert result.code == 3
     assert "held until one comes" in result.err
-    assert "260 bytes skipped: no-config" in result.err
+    assert "260 bytes skipped: no-config: no configuration came for 10 frames: not kept; a capture" in result.err
+
+
+@pytest.mark.parametrize("suffix", ["pcapng", "c37118", "mcap"])
+def test_captures_keep_data_without_a_configuration(suffix: str, tmp_path: Path) -> None:
+    port, out = free_udp_port(), tmp_path / f"x.{suffix}"
+    with started("read", f"udp://127.0.0.1:{port}", "--out", out, "--duration", 1.2, "--json") as reader:
+        wait_for_udp(port, reader)
+        send(port, [message.frame.data for message in recording(stream(), 10, announced=False)])
+        result = ended(reader)
+    assert result.code == 3
+    assert "260 bytes undecoded: no-config: no configuration came for 10 frames: kept undecoded" in result.err
+    told = result.json
+    assert (told["frames"], told["undecoded_frames"], told["kept_undecoded"]) == (0, 10, 10)
+    found = run_pmu("dump", out, "--json")
+    assert [(each["reason"], each["nbytes"]) for each in found.lines] == [("no-config", 26)] * 10
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ class _Packed(NamedTuple):
 @dataclass(frozen=True)
 class _Entry:
     at_ns: int
-    items: tuple[_Packed | Block | Message, ...]
+    items: tuple[_Packed | Block | Message | Loss, ...]
     nbytes: int
 
 
@@ -55,7 +55,7 @@ class History:
 
     def add(self, found: Round, at_ns: int) -> None:
         """A round that ended at ``at_ns``."""
-        items = tuple(_packed(item) for item in found if not isinstance(item, Loss))
+        items = tuple(_packed(item) for item in found if not (isinstance(item, Loss) and item.frame is None))
         nbytes = sum(map(_nbytes, items))
         self._entries.append(_Entry(at_ns, items, nbytes))
         self.nbytes += nbytes
@@ -63,7 +63,7 @@ class History:
     def at_ns(self, number: int) -> int:
         return self._entries[number - self.first].at_ns
 
-    def round(self, number: int) -> list[Block | Message]:
+    def round(self, number: int) -> list[Block | Message | Loss]:
         """Round ``number``, as it was."""
         entry = self._entries[number - self.first]
         return [item.block() if isinstance(item, _Packed) else item for item in entry.items]
@@ -75,7 +75,7 @@ class History:
         self.nbytes -= entry.nbytes
 
 
-def _packed(item: Block | Message) -> _Packed | Block | Message:
+def _packed(item: Block | Message | Loss) -> _Packed | Block | Message | Loss:
     if isinstance(item, Block) and item.batch.wire is not None:
         flow, batch = item
         sources = np.ascontiguousarray(batch.stamp_source)
@@ -83,9 +83,9 @@ def _packed(item: Block | Message) -> _Packed | Block | Message:
     return item
 
 
-def _nbytes(item: _Packed | Block | Message) -> int:
+def _nbytes(item: _Packed | Block | Message | Loss) -> int:
     if isinstance(item, _Packed):
         return ITEM_BYTES + len(item.wire) + item.arrival_ns.nbytes + item.stamp_source.nbytes
     if isinstance(item, Block):
         return ITEM_BYTES + len(item.batch) * item.batch.config.frame_size * 5
-    return ITEM_BYTES + len(item.frame.data)
+    return ITEM_BYTES + (len(item.frame.data) if item.frame is not None else 0)

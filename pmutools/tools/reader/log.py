@@ -9,6 +9,7 @@ from typing import Protocol
 
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import FLOWS, Loss, Message
 from pmutools.flow import Flow
 from pmutools.formats import Sink
@@ -21,6 +22,10 @@ _Keyed = tuple[int, Message]
 
 class Recorder(Protocol):
     """Takes rounds. Every method raises SourceError where the system refuses to write."""
+
+    @property
+    def undecoded(self) -> int:
+        """Frames recorded as they came, because no configuration came for them."""
 
     @property
     def paths(self) -> list[Path]:
@@ -41,6 +46,7 @@ class Log:
 
     def __init__(self, sink: Sink) -> None:
         self.sink = sink
+        self.undecoded = 0
         self._shown: Shown = {}
 
     @property
@@ -55,6 +61,7 @@ class Log:
             return
         for message in messages_of(found, self._shown):
             self.sink.write(message)
+            self.undecoded += message.config is None and message.frame.type is FrameType.DATA
         if len(self._shown) > FLOWS:  # connections made anew and anew: configurations are written once more
             self._shown.clear()
 
@@ -66,7 +73,7 @@ class Log:
 
 
 def messages_of(found: Round, shown: Shown) -> Iterable[Message]:
-    """A round's frames in order of arrival, none before its configuration.
+    """A round's frames in order of arrival, none before its configuration, those that none came for without one.
 
     ``shown`` are the configurations that have been given out; one that lacks is made up before the first frame that
     needs it. Memory: the frames of the round.
@@ -75,7 +82,9 @@ def messages_of(found: Round, shown: Shown) -> Iterable[Message]:
     since: dict[tuple[Flow, int], int] = {}
     for item in found:
         if isinstance(item, Loss):
-            continue
+            if item.frame is None:
+                continue
+            item = Message(item.frame, item.flow, None)
         if isinstance(item, Block):
             key = item.flow, item.batch.config.idcode
             keyed += _keyed(frames_of(item, shown), since.get(key, NO_TIME))

@@ -57,7 +57,9 @@ class Reading:
     latest_ns: int | None = None
     streams: dict[tuple[Flow, int], StreamReading] = field(default_factory=dict)
     skipped: Counter[str] = field(default_factory=Counter)
-    """Bytes that are in no frame, by reason."""
+    """Bytes that are in no frame, or that no configuration came for, by reason."""
+    undecoded: int = 0
+    """Data frames that no configuration came for."""
     skipped_by_flow: dict[str, Counter[str]] = field(default_factory=dict)
     own_drops: int = 0
 
@@ -69,6 +71,7 @@ class Reading:
             elif isinstance(item, Loss):
                 reason, nbytes = item.skipped.reason, item.skipped.nbytes
                 self.skipped[str(reason)] += nbytes
+                self.undecoded += item.frame is not None
                 self.skipped_by_flow.setdefault(flow_name(item), Counter())[str(reason)] += nbytes
             elif item.frame.type is FrameType.DATA:  # pragma: no cover - rounds give data as blocks
                 raise TypeError("data frames come in blocks")
@@ -80,6 +83,7 @@ class Reading:
             "bytes": self.tally.fed,
             "skipped": dict(self.skipped),
             "skipped_by_flow": {flow: dict(reasons) for flow, reasons in self.skipped_by_flow.items()},
+            "undecoded_frames": self.undecoded,
             "own_drops": self.own_drops,
         }
 

@@ -82,6 +82,11 @@ class Ring:
         return self._files.paths + (event.log.paths if event is not None else [])
 
     @property
+    def undecoded(self) -> int:
+        event = self._event
+        return self._files.undecoded + (event.log.undecoded if event is not None else 0)
+
+    @property
     def idle(self) -> tuple[str, ...]:
         """Conditions that no station or channel has fitted so far."""
         return self._watch.idle
@@ -150,7 +155,7 @@ class Ring:
     def _end(self, event: _Event) -> None:
         self._event = None
         event.log.close()
-        self._files.add(event.log.paths)
+        self._files.add(event.log)
         self._tell(f"recorded {', '.join(map(str, event.log.paths[:4])) or 'nothing'}")
 
     def _forget(self, now_ns: int) -> None:

@@ -45,16 +45,18 @@ class Files:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self.undecoded = 0
         self._recordings: deque[list[Path]] = deque()
 
     @property
     def paths(self) -> list[Path]:
         return [path for recording in list(self._recordings) for path in recording]
 
-    def add(self, paths: list[Path]) -> None:
+    def add(self, log: Log) -> None:
         """A recording is finished."""
-        if paths:
-            self._recordings.append(list(paths))
+        self.undecoded += log.undecoded
+        if log.paths:
+            self._recordings.append(list(log.paths))
 
     def trim(self, count: int) -> None:
         """Delete the oldest, so that ``count`` are left. Raises SourceError where one cannot be deleted."""
@@ -95,14 +97,18 @@ class Rolling:
     def paths(self) -> list[Path]:
         return self._files.paths + ([] if self._closed else self._log.paths)
 
+    @property
+    def undecoded(self) -> int:
+        return self._files.undecoded + (0 if self._closed else self._log.undecoded)
+
     def take(self, found: Round) -> None:
         if self._filled and self._is_due():
             self._end()
             self._log = self._next()
         self._slot = self._present_slot()
         items = list(found)
-        self._filled = self._filled or any(isinstance(item, Block) for item in items)
         self._log.take(items)
+        self._filled = self._filled or self._log.undecoded > 0 or any(isinstance(item, Block) for item in items)
 
     def flush(self) -> None:
         self._log.flush()
@@ -123,7 +129,7 @@ class Rolling:
     def _end(self) -> None:
         self._log.close()
         if self._filled:
-            self._files.add(self._log.paths)
+            self._files.add(self._log)
         else:
             self._files.delete(self._log.paths)
 

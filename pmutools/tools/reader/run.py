@@ -19,6 +19,8 @@ from pmutools.tools.reader.steps import Direct, Threaded
 
 FLUSH_NS = NS
 """What a killed reader can lose at most: what came since."""
+LOSS_BYTES = 600
+"""What a loss takes beside its bytes, about."""
 Observer = Callable[[Sequence[Block | Message | Loss]], None]
 
 
@@ -101,7 +103,8 @@ def _told(recorder: Recorder, reading: Reading) -> Iterator[None]:
 
 def weight(found: Sequence[Block | Message | Loss]) -> int:
     """Bytes that a round takes in memory, about: its columns are some times its frames."""
-    return sum(6 * len(item.batch) * item.batch.config.frame_size for item in found if isinstance(item, Block))
+    blocks = sum(6 * len(item.batch) * item.batch.config.frame_size for item in found if isinstance(item, Block))
+    return blocks + sum(LOSS_BYTES + item.skipped.nbytes for item in found if isinstance(item, Loss))
 
 
 def _fate(reading: Reading) -> str:
