@@ -157,20 +157,24 @@ def size_bytes(text: str) -> int:
 
 def span_or_size(text: str) -> tuple[int | None, int | None]:
     """:func:`span_ns` or :func:`size_bytes`, by the unit; the other is None."""
-    match = _MEASURE.fullmatch(text.strip())
-    if match is not None and match[2].lower() in {unit.lower() for unit in _SIZES}:
-        return None, size_bytes(text)
-    return span_ns(text), None
+    value = _measured(text, _SIZES | _SPANS_NS, "a size or a span of time; write as in 100MB or 1h")
+    return (None, value) if _unit(text) in {unit.lower() for unit in _SIZES} else (value, None)
 
 
 def _measured(text: str, units: Mapping[str, int], what: str) -> int:
     match = _MEASURE.fullmatch(text.strip())
-    factor = None if match is None else {unit.lower(): each for unit, each in units.items()}.get(match[2].lower())
+    factor = {unit.lower(): each for unit, each in units.items()}.get(_unit(text))
     if match is None or factor is None:
         raise ValueError(f"{text!r} is not {what} (units: {', '.join(units)})")
     if not (value := round(Decimal(match[1]) * factor)):
-        raise ValueError(f"{text} is nothing; it must be more")
+        raise ValueError(f"{text} is nothing; it must be more than 0")
     return value
+
+
+def _unit(text: str) -> str:
+    """The letters after a number, in lower case; empty where there is no such thing."""
+    match = _MEASURE.fullmatch(text.strip())
+    return "" if match is None else match[2].lower()
 
 
 class Place(NamedTuple):

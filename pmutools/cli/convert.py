@@ -53,12 +53,15 @@ def command(
     with open_sink(output, phasors="rect" if phasors == "rect" else "polar", long=long_form) as sink:
         result = convert(Watched(source, talk), sink, window)
     paths = [str(path) for path in sink.paths]
+    told = json.dumps(result.to_json() | {"paths": paths})
     if as_json and output != "-":
-        click.echo(json.dumps(result.to_json() | {"paths": paths}))
+        click.echo(told)
     if not result.frames:
         talk.complain(f"pmu convert: no data frames in {', '.join(inputs)} within what was asked for")
         return Exit.FAILED
     talk.say(f"{result.frames} data frames of {result.streams} streams -> {', '.join(paths)}")
     for name, count in result.losses.items():
         talk.say(f"  {name}: {count}")
+    if as_json and output == "-":  # standard output has the data
+        click.echo(told, err=True)
     return Exit.INCOMPLETE if result.losses else Exit.DONE

@@ -161,9 +161,11 @@ def open_sink(
         raise SettingsError(f"cannot write {path} as {form}: its suffix says {found.kind}")
     if stdout and per_stream:
         raise SettingsError("several files cannot go to standard output; name a file")
+    tables = ", ".join(each.suffixes[0] for each in FORMATS if each.tabular)
     if (long or fields is not None) and not found.tabular:
-        tables = ", ".join(each.suffixes[0] for each in FORMATS if each.tabular)
         raise SettingsError(f"{path}: {found.kind} holds whole frames; fields and long form are for {tables}")
+    if phasors == "rect" and not found.tabular:
+        raise SettingsError(f"{path}: {found.kind} has one notation of phasors; to choose it is for {tables}")
     if long and per_stream:
         raise SettingsError("long form is one file of all streams, and none a stream; choose one")
     options = SinkOptions(phasors, long, fields, per_stream, name, found.suffixes[0])

@@ -329,6 +329,22 @@ def test_the_summary_tells_each_stream(pmu: Pmu, tmp_path: Path) -> None:
     assert told["paths"] == [str(tmp_path / "log.mcap")]
 
 
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+def test_the_summary_of_what_goes_to_standard_output_is_the_last_line_of_the_other(quiet: list[str]) -> None:
+    port = free_udp_port()
+    with started("read", url(port), "--out", "-", "--json", "--duration", 1.2, *quiet) as reader:
+        wait_for_udp(port, reader)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for frame in frames_of(7, 10):
+                sender.sendto(frame, ("127.0.0.1", port))
+        result = ended(reader)
+    assert result.code == 0
+    assert len(result.out.splitlines()) == 11
+    *talk, last = result.err.splitlines()
+    assert bool(talk) == (not quiet)
+    assert json.loads(last)["frames"] == 10
+
+
 def test_sigterm_ends_as_an_interrupt_does(tmp_path: Path) -> None:
     port, out = free_udp_port(), tmp_path / "log.parquet"
     with started("read", url(port), "--out", out, "--quiet") as reader:
@@ -354,9 +370,13 @@ MISTAKES = [
     (f"read {U} --out x.mcap --fields time", 2, "mcap holds whole frames; fields and long form are for"),
     (f"read {U} --out x.pcap --long", 2, "pcap holds whole frames"),
     (f"read {U} --out x.csv --fields a,,b", 2, "'--fields': 'a,,b' has an empty item"),
-    (f"read {U} --out x.csv --split 5", 2, "'--split': '5' is not a span of time"),
-    (f"read {U} --out x.csv --split 5furlongs", 2, "(units: ms, s, min, h, d)"),
-    (f"read {U} --out x.csv --split 0MB", 2, "0MB is nothing"),
+    *((f"read {U} --out x.{suffix} --phasors rect", 2, "one notation of phasors") for suffix in ("pcapng", "mcap")),
+    (f"read {U} --out - --format raw --phasors rect", 2, "raw has one notation of phasors; to choose it is for"),
+    (f"read {U} --out x.csv --split 5", 2, "'--split': '5' is not a size or a span of time; write as in 100MB or 1h"),
+    (f"read {U} --out x.csv --split 5furlongs", 2, "(units: kB, MB, GB, TB, KiB, MiB, GiB, ms, s, min, h, d)"),
+    (f"read {U} --out x.csv --split 0MB", 2, "0MB is nothing; it must be more than 0"),
+    (f"read {U} --out x.csv --split 0h", 2, "0h is nothing; it must be more than 0"),
+    *((f"read {U} --out x.csv --split {bad}", 2, f"'{bad}' is not a size or") for bad in ("0", "-1", "banana")),
     (f"read {U} --out - --split 1h", 2, "several files cannot go to standard output"),
     (f"read {U} --out - --trigger loss", 2, "several files cannot go to standard output"),
     (f"read {U} --out - --per-stream", 2, "several files cannot go to standard output"),

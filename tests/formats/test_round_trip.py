@@ -160,8 +160,8 @@ def test_streams_come_back(case: Case, tmp_path: Path) -> None:
 @every_format
 def test_values_come_back(case: Case, tmp_path: Path) -> None:
     path, reference = tmp_path / f"recording{case.suffix}", tmp_path / "reference.pcap"
-    for target in (path, reference):
-        write(target, recording(), **case.options)
+    write(path, recording(), **case.options)
+    write(reference, recording())
     expected, found = columns(reference), columns(written(path))
     assert found.keys() == expected.keys() == {7, 60}
     for idcode, batch in expected.items():
