@@ -57,11 +57,11 @@ class DataRun(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """Bytes of ``flow`` that are in no message. ``frame``: they are a data frame for which no configuration came."""
+    """Bytes of ``flow`` that are in no message. ``undecoded``: they are a data frame for which no configuration came."""
 
     skipped: Skipped
     flow: Flow
-    frame: Frame | None = None
+    undecoded: Frame | None = None
 
 
 @dataclass

@@ -37,6 +37,6 @@ class News:
         self.reasons.hear(event)
         text = told(event)
         if self._verbose or (event.kind not in USUAL and self._said.get(event.where) != text):
-            self._say(f"{event.where}: {text}")
+            self._say(f"{event.label or event.where}: {text}")
         if event.where in self._said or len(self._said) < PLACES:
             self._said[event.where] = text

@@ -33,7 +33,7 @@ def describe(item: Message | Loss) -> Json:
     if isinstance(item, Loss):
         reason, offset, nbytes, _ = item.skipped
         told = {"type": "skipped", "reason": str(reason), "offset": offset, "nbytes": nbytes, "flow": flow_name(item)}
-        return told | (_undecoded(item.frame) if item.frame is not None else {})
+        return told | (_undecoded(item.undecoded) if item.undecoded is not None else {})
     frame, _, config = item
     if frame.type is FrameType.DATA and config is None:
         skipped = Skipped(SkipReason.NO_CONFIG, frame.offset, len(frame.data), frame.idcode)

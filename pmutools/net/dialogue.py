@@ -59,7 +59,10 @@ def silence(multicast: bool, open_ns: int) -> str:
 
 
 class LinkEvent(NamedTuple):
-    """News of the endpoints ``owners`` (their places in the list given). ``detail`` is for people."""
+    """News of the endpoints ``owners`` (their places in the list given). ``detail`` is for people.
+
+    ``label`` is what people are told instead of ``where``, if anything: their own words for it.
+    """
 
     kind: LinkKind
     where: str
@@ -68,6 +71,7 @@ class LinkEvent(NamedTuple):
     idcode: int | None = None
     flow: Flow | None = None
     datagrams: int = 0
+    label: str = ""
 
 
 class Dialogue:

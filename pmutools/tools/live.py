@@ -28,6 +28,8 @@ ROUND_NS = 250_000_000
 """How long data frames are gathered before they are handed on, and at most before they are looked at."""
 BACKLOG_NS = 30_000_000_000
 """Reading what waits in the sockets in the end takes no longer, whatever its stamps say."""
+TOLD = 3
+"""So many of the endpoints that a sender belongs to are named."""
 ROUND_FRAMES = 1 << 16
 """So many data frames are handed on before their round is over."""
 
@@ -179,12 +181,13 @@ class LiveSource:
     @property
     def silent(self) -> list[tuple[int, str]]:
         """Place and name of the endpoints from which no frame has come."""
-        heard, endpoints = self.receivers.routes.heard, self.receivers.endpoints
-        return [
-            (index, str(endpoint) if site is None else site.name)
-            for index, (endpoint, site) in enumerate(zip(endpoints, self.sites, strict=True))
-            if index not in heard
-        ]
+        heard = self.receivers.routes.heard
+        return [(index, self._name(index)) for index in range(len(self.sites)) if index not in heard]
+
+    def _name(self, index: int) -> str:
+        """What the user calls the endpoint at a place."""
+        site = self.sites[index]
+        return str(self.receivers.endpoints[index]) if site is None else site.name
 
     def name(self, flow: Flow, config: StreamConfig) -> str:
         """What a stream is called: as its sites, all of them with a ``+`` between, else as its configuration says."""
@@ -222,7 +225,15 @@ class LiveSource:
     def _take_news(self, event: LinkEvent) -> None:
         self.own_drops += event.datagrams
         if self._tell is not None:
-            self._tell(event)
+            self._tell(event._replace(label=self._label(event)))
+
+    def _label(self, event: LinkEvent) -> str:
+        """What the user calls the sender that news are about; empty where they are about what he has named."""
+        flow = event.flow
+        if flow is None or not event.owners or event.where != f"{flow.transport}://{flow.source}":
+            return ""
+        mine = "+".join(self._name(place) for place in event.owners[:TOLD])
+        return mine if flow.source in event.detail else f"{mine} (IDCODE {event.idcode} from {flow.source})"
 
     def _take_host_news(self) -> None:
         for event in self.host.news():

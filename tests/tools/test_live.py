@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,22 +17,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.playing import recording, stream
+from support.playing import START_NS, recording, stream
 from support.recordings import write
 
 from pmutools import linux
 from pmutools.c37118 import FrameType, Message, StreamConfig, encode_config
 from pmutools.c37118.batch import decode_batch
 from pmutools.c37118.demux import Loss
+from pmutools.cli.news import News
 from pmutools.clock import VirtualClock
 from pmutools.flow import Flow
 from pmutools.formats.source import Block
 from pmutools.host import ClockStep, Stall
 from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.tcp import TcpCounts
 from pmutools.sites import Site, load_sites
 from pmutools.timebase import NS
 from pmutools.tools import live
+from pmutools.tools.characterizer.engine import Engine
+from pmutools.tools.characterizer.wanted import wanted_of
 from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.recorder import names_of
 from pmutools.tools.recordings import saved_configs
@@ -71,6 +75,29 @@ def wires(items: Sequence[Item]) -> dict[int, list[tuple[bytes, StreamConfig]]]:
                 (raw[at : at + size], item.batch.config) for at in range(0, len(raw), size)
             ]
     return dict(found)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_news_of_a_sender_name_it_as_the_user_does(named: bool) -> None:
+    """In virtual time: it falls silent at once."""
+    news: list[LinkEvent] = []
+    url = "udp://127.0.0.1:0?idcode=7"
+    wanted = Site("NORTH", parse_endpoint(url)) if named else url
+    source = LiveSource([wanted], duration_ns=8 * NS, clock=VirtualClock(START_NS), tell=news.append)
+    with source, sending(source) as sender:
+        for frame in frames_of(recording(stream(7), 5)):
+            sender.send(frame)
+        deque(source.rounds(), maxlen=0)
+        (silent,) = [event for event in news if event.kind is LinkKind.SILENT]
+        host, port = sender.getsockname()
+        assert silent.label == f"{'NORTH' if named else url} (IDCODE 7 from {host}:{port})"
+        assert {event.label for event in news if event.kind is LinkKind.BOUND} == {""}
+        said: list[str] = []
+        News(said.append, 0)(silent)
+        assert said == [f"{silent.label}: silent"]
+        engine = Engine(wanted_of([url]))
+        engine.hear(silent, START_NS)
+        assert [line for _, line in engine.chronicle.lines()] == said
 
 
 def test_rounds_hold_all_that_came_in_order() -> None:
@@ -249,6 +276,8 @@ def test_a_stream_is_called_by_all_its_sites(tmp_path: Path) -> None:
 
 STALLED = """
 import sys
+from pmutools.tools.characterizer.engine import Engine
+from pmutools.tools.characterizer.wanted import wanted_of
 from pmutools.tools.live import LiveSource
 told = []
 url = "udp://127.0.0.1:0"

@@ -48,7 +48,7 @@ def read_into(out: Path, given: list[list[Item]], **options: bool) -> tuple[Read
 def undecoded_in(path: Path) -> list[tuple[bytes, int | None]]:
     """Of a recording: frames without a configuration, with their arrivals."""
     losses = [item for item in open_source(path).items() if isinstance(item, Loss)]
-    return [(loss.frame.data, loss.frame.arrival_ns) for loss in losses if loss.frame is not None]
+    return [(loss.undecoded.data, loss.undecoded.arrival_ns) for loss in losses if loss.undecoded is not None]
 
 
 @pytest.mark.parametrize("suffix", BYTES)
@@ -120,7 +120,7 @@ def test_what_waits_is_bounded_and_the_oldest_go_first(monkeypatch: pytest.Monke
     config, *data = recording(stream(9), 20, latency_ns=LATENCY_NS)
     found = [part for message in data for part in demux.feed(chunk_of(message))]
     assert demux.pending == 5 * len(FRAMES[0])
-    assert [part.frame.data for part in found if isinstance(part, Loss) and part.frame] == FRAMES[:15]
+    assert [part.undecoded.data for part in found if isinstance(part, Loss) and part.undecoded] == FRAMES[:15]
     released = demux.feed(chunk_of(config))
     assert [part.frame.data for part in released if isinstance(part, Message)] == [config.frame.data, *FRAMES[15:]]
     assert demux.tally.fed == demux.tally.framed + demux.tally.skipped_bytes

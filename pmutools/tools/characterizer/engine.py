@@ -169,7 +169,7 @@ class Engine:
     def hear(self, event: LinkEvent, now_ns: int) -> None:
         """Take note of news of connections."""
         if self._is_news(event):
-            self.chronicle.add(now_ns, f"{event.where}: {told(event)}")
+            self.chronicle.add(now_ns, f"{event.label or event.where}: {told(event)}")
         if event.flow is not None and event.owners and len(self._flow_owners) < _FLOWS:
             self._flow_owners[event.flow] = event.owners
         over_tcp = event.flow is not None and event.flow.transport == "tcp"

@@ -55,7 +55,7 @@ class History:
 
     def add(self, found: Round, at_ns: int) -> None:
         """A round that ended at ``at_ns``."""
-        items = tuple(_packed(item) for item in found if not (isinstance(item, Loss) and item.frame is None))
+        items = tuple(_packed(item) for item in found if not (isinstance(item, Loss) and item.undecoded is None))
         nbytes = sum(map(_nbytes, items))
         self._entries.append(_Entry(at_ns, items, nbytes))
         self.nbytes += nbytes
@@ -88,4 +88,4 @@ def _nbytes(item: _Packed | Block | Message | Loss) -> int:
         return ITEM_BYTES + len(item.wire) + item.arrival_ns.nbytes + item.stamp_source.nbytes
     if isinstance(item, Block):
         return ITEM_BYTES + len(item.batch) * item.batch.config.frame_size * 5
-    return ITEM_BYTES + (len(item.frame.data) if item.frame is not None else 0)
+    return ITEM_BYTES + (item.skipped.nbytes if isinstance(item, Loss) else len(item.frame.data))

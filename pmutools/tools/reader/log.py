@@ -82,9 +82,9 @@ def messages_of(found: Round, shown: Shown) -> Iterable[Message]:
     since: dict[tuple[Flow, int], int] = {}
     for item in found:
         if isinstance(item, Loss):
-            if item.frame is None:
+            if item.undecoded is None:
                 continue
-            item = Message(item.frame, item.flow, None)
+            item = Message(item.undecoded, item.flow, None)
         if isinstance(item, Block):
             key = item.flow, item.batch.config.idcode
             keyed += _keyed(frames_of(item, shown), since.get(key, NO_TIME))

@@ -71,7 +71,7 @@ class Reading:
             elif isinstance(item, Loss):
                 reason, nbytes = item.skipped.reason, item.skipped.nbytes
                 self.skipped[str(reason)] += nbytes
-                self.undecoded += item.frame is not None
+                self.undecoded += item.undecoded is not None
                 self.skipped_by_flow.setdefault(flow_name(item), Counter())[str(reason)] += nbytes
             elif item.frame.type is FrameType.DATA:  # pragma: no cover - rounds give data as blocks
                 raise TypeError("data frames come in blocks")
