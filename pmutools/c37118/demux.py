@@ -57,7 +57,7 @@ class DataRun(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """Bytes of ``flow`` that are in no message. ``undecoded``: they are a data frame for which no configuration came."""
+    """Bytes of ``flow`` that are in no message. ``undecoded``: a whole data frame, for which no configuration came."""
 
     skipped: Skipped
     flow: Flow

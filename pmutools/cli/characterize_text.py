@@ -58,7 +58,7 @@ def worst(streams: Sequence[Stream]) -> list[Stream]:
 
     def badness(stream: Stream) -> tuple[float, int, float]:
         lost = 1.0 if not stream["received"] else _share(stream, "lost", "expected") or 0.0
-        return lost, len(stream["diagnoses"]), stream["delay_ms"]["p99"] or 0.0
+        return lost, sum(not _is_note(each) for each in stream["diagnoses"]), stream["delay_ms"]["p99"] or 0.0
 
     return sorted(streams, key=badness, reverse=True)[:TOLD_STREAMS]
 
@@ -122,7 +122,8 @@ def _diagnoses(streams: Sequence[Stream]) -> Iterator[str]:
     found: dict[str, list[tuple[str, str]]] = {}
     for stream in streams:
         for diagnosis in stream["diagnoses"]:
-            found.setdefault(diagnosis["id"], []).append((stream["name"], diagnosis["text"]))
+            text = f"note: {diagnosis['text']}" if _is_note(diagnosis) else diagnosis["text"]
+            found.setdefault(diagnosis["id"], []).append((stream["name"], text))
     for said in found.values():
         (name, text), names = said[0], [other for other, _ in said]
         if len(said) > 1 and len({text for _, text in said}) == 1:
@@ -131,6 +132,10 @@ def _diagnoses(streams: Sequence[Stream]) -> Iterator[str]:
         yield f"{name}: {text}"
         if others := names[1:]:
             yield f"  so, with numbers of their own: {_named(others)}"
+
+
+def _is_note(diagnosis: Mapping[str, Any]) -> bool:
+    return diagnosis.get("level") == "note"
 
 
 def _named(names: Sequence[str]) -> str:

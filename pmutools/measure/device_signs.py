@@ -239,6 +239,35 @@ def _unscaled(scene: Scene) -> str | None:
     return f"{' and '.join(told)} has the factor 0: their scale is not kept up, and their values are to be asked after"
 
 
+def _idle_scale(scene: Scene) -> str | None:
+    """PHUNIT's factor is to be ignored beside floats; ANUNIT's is the user's own, and 1 in the standard's example."""
+    stations = scene.result.config.stations
+    of_phasors = [
+        channel.phunit & 0xFFFFFF
+        for station in stations
+        if station.format & Format.PHASOR_FLOAT
+        for channel in station.phasors
+        if channel.phscale is None
+    ]
+    of_analogs = [
+        channel.anunit & 0xFFFFFF if channel.anunit & 0xFFFFFF != 1 else 0
+        for station in stations
+        if station.format & Format.ANALOG_FLOAT
+        for channel in station.analogs
+    ]
+    told = [
+        f"{name} of {sum(map(bool, factors))} {what}(s) ({', '.join(map(str, sorted({*factors} - {0})[:3]))})"
+        for name, factors, what in (("PHUNIT", of_phasors, "phasor"), ("ANUNIT", of_analogs, "analog"))
+        if any(factors)
+    ]
+    if not told:
+        return None
+    return (
+        f"values are sent as floating point, and {' and '.join(told)} has a factor as for integers: it is "
+        "ignored here, and who multiplies by it is wrong by that much"
+    )
+
+
 ROWS: tuple[Row, ...] = (
     Row("silent", "no frame at all", _silent),
     Row("stopped", "nothing new for 3 s and 30 periods at the end", _stopped),
@@ -256,4 +285,7 @@ ROWS: tuple[Row, ...] = (
     Row("concentrator", "the only PMU of a stream has another IDCODE", _concentrated),
     Row("unmasked-digitals", "digital words of which DIGUNIT calls no bit valid", _unmasked),
     Row("zero-scale", "PHUNIT of integer phasors, or ANUNIT of typed analogs, with factor 0", _unscaled),
+)
+NOTES: tuple[Row, ...] = (
+    Row("idle-scale", "PHUNIT or ANUNIT of floating-point values with a factor for integers", _idle_scale, "note"),
 )

@@ -8,9 +8,9 @@ from __future__ import annotations
 from pmutools.measure import arrival_signs, clock_signs, device_signs
 from pmutools.measure.scene import Diagnosis, Row, Scene
 
-ROWS: tuple[Row, ...] = (*clock_signs.ROWS, *device_signs.ROWS, *arrival_signs.ROWS)
+ROWS: tuple[Row, ...] = (*clock_signs.ROWS, *device_signs.ROWS, *arrival_signs.ROWS, *device_signs.NOTES)
 
 
 def diagnose(scene: Scene) -> list[Diagnosis]:
-    """All rows that have something to say, in the table's order: clocks first, since they colour all else."""
-    return [Diagnosis(row.id, text) for row in ROWS if (text := row.test(scene))]
+    """All rows that have something to say, in the table's order: clocks first, as they colour all else; notes last."""
+    return [Diagnosis(row.id, text, row.level) for row in ROWS if (text := row.test(scene))]

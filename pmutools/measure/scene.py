@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import median_low
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from pmutools.measure.clockquality import ClockLog
 from pmutools.measure.delay import SECOND_WITHIN_NS
@@ -60,14 +60,17 @@ class Scene:
         return delays.locked.count / delays.delay.count if delays.delay.count else 0.0
 
 
+Level = Literal["finding", "note"]
+"""A note is of what many devices do and no figure suffers from."""
 Test = Callable[[Scene], str | None]
 
 
 class Diagnosis(NamedTuple):
-    """A finding: the row's id and its sentence."""
+    """A finding: the row's id, its sentence and its level."""
 
     id: str
     text: str
+    level: Level = "finding"
 
 
 class Row(NamedTuple):
@@ -76,6 +79,7 @@ class Row(NamedTuple):
     id: str
     sign: str
     test: Test
+    level: Level = "finding"
 
 
 def _middle(result: StreamResult) -> float | None:

@@ -233,9 +233,10 @@ def findings(view: View) -> list[Finding]:
     ]
 
 
+_NOTES = frozenset(row.id for row in ROWS if row.level == "note")
 _ACRONYMS = {"tai": "TAI", "utc": "UTC", "tcp": "TCP"}
 
 
 def _heading(kind: str) -> str:
     words = " ".join(_ACRONYMS.get(word, word) for word in kind.split("-"))
-    return words[:1].upper() + words[1:]
+    return words[:1].upper() + words[1:] + (" (a note)" if kind in _NOTES else "")

@@ -34,5 +34,6 @@ REMEDIES = {
     "tcp-batching": "UDP, or TCP_NODELAY at the sender, or a capture on the wire",
     "uneven-arrival": "hold the last input for a window, or step later; ask the vendor for even departures",
     "late-frames": "let the concentrator wait longer, or shorten the way",
+    "idle-scale": "none is needed for who follows the standard; have factors set to 0 at the device",
     "concentrator": "measure at the PMU too, if its own delay matters",
 }

@@ -18,7 +18,7 @@ from support.live import data_frame
 from support.playing import MS, START_NS, interleaved, recording, stream
 from support.recordings import write
 
-from pmutools.c37118 import Frame, Message
+from pmutools.c37118 import Format, Frame, Message
 from pmutools.c37118.checksum import sealed
 from pmutools.flow import Flow, StampSource
 from pmutools.impair.profile import read_profile_file
@@ -266,6 +266,7 @@ CASES: dict[str, Callable[[], list[Message]]] = {
     "odd-time-base": lambda: recording(stream(time_base=0xFFFFFF), 300, latency_ns=jittery),
     "concentrator": lambda: with_station(idcode=61),
     "zero-scale": lambda: with_station(phasors=(replace(stream().stations[0].phasors[0], phunit=0),)),
+    "idle-scale": lambda: with_station(format=Format(2)),
     "leap-second": leaping,
     "leap-smear": smeared,
     "multicast-ageing": forgotten,
@@ -292,8 +293,8 @@ def test_a_sound_capture_has_none_of_them(tmp_path: Path) -> None:
 
 
 QUIRKS = {
-    "C37.118_1PMU_TCP.pcap": {"locked-but-off", "odd-time-base", "trigger-stuck"},
-    "C37.118_1PMU_UDP.pcap": {"locked-but-off", "concentrator", "unmasked-digitals"},
+    "C37.118_1PMU_TCP.pcap": {"locked-but-off", "odd-time-base", "trigger-stuck", "idle-scale"},
+    "C37.118_1PMU_UDP.pcap": {"locked-but-off", "concentrator", "unmasked-digitals", "idle-scale"},
     "C37.118_4in1PMU_TCP.pcap": {
         "locked-but-off",
         "unmasked-digitals",
@@ -302,8 +303,9 @@ QUIRKS = {
         "tcp-batching",
         "uneven-arrival",
         "periodic-delay",
+        "idle-scale",
     },
-    "c37_1100_fullclean.pcap": {"unsynchronised", "clock-off"},
+    "c37_1100_fullclean.pcap": {"unsynchronised", "clock-off", "idle-scale"},
 }
 
 

@@ -39,7 +39,7 @@ def test_a_device_that_claims_to_be_locked_and_is_days_behind() -> None:
     assert (stream["expected"], stream["received"], stream["lost"]) == (252, 252, 0)
     assert stream["delay_ms"]["p50"] / 86_400_000 == pytest.approx(4.79, abs=0.01)
     assert stream["pdv_ms"]["max"] < 40
-    assert ids(stream) == {"locked-but-off", "odd-time-base", "trigger-stuck"}
+    assert ids(stream) == {"locked-but-off", "odd-time-base", "trigger-stuck", "idle-scale"}
     assert stream["fit"]["of"] == "pdv"
 
 
@@ -51,7 +51,7 @@ def test_a_concentrator_over_tcp_that_sends_in_lumps() -> None:
 
 def test_a_concentrator_that_numbers_its_stream_otherwise() -> None:
     (stream,) = told("C37.118_1PMU_UDP.pcap")
-    assert ids(stream) == {"locked-but-off", "concentrator", "unmasked-digitals"}
+    assert ids(stream) == {"locked-but-off", "concentrator", "unmasked-digitals", "idle-scale"}
 
 
 def test_an_unsynchronised_device_with_usable_values() -> None:
@@ -61,4 +61,4 @@ def test_an_unsynchronised_device_with_usable_values() -> None:
     assert stream["delay_locked_ms"]["count"] == 0
     assert stream["uncertainty_ms"] is None
     assert stream["per_window"] == {"0": 0, "1": 422, "2+": 0}
-    assert ids(stream) == {"unsynchronised", "clock-off"}
+    assert ids(stream) == {"unsynchronised", "clock-off", "idle-scale"}

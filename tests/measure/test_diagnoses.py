@@ -253,6 +253,11 @@ SICK: dict[str, tuple[Scene, str]] = {
     ),
     "zero-scale": (Scene(quirky(format=Format(0)), clock()), "PHUNIT of 1 phasor(s)"),
     "zero-scale analogs": (Scene(quirky(analogs=(AnalogChannel("P", 0x46000000),)), clock()), "ANUNIT of 1 analog(s)"),
+    "idle-scale": (Scene(quirky(phasors=(PhasorChannel("V", 756),)), clock()), "PHUNIT of 1 phasor(s) (756)"),
+    "idle-scale analogs": (
+        Scene(quirky(analogs=(AnalogChannel("P", 5), AnalogChannel("Q", 0))), clock()),
+        "ANUNIT of 1 analog(s) (5)",
+    ),
     "two-senders at once": (Scene(with_events(senders=2), clock()), "2 senders feed this stream at once"),
     "reconnects": (Scene(with_events(disconnects=2, connects=3), clock()), "2 time(s), and 3 were made"),
     "tcp-losses": (Scene(with_events(out_of_order=50), clock()), "50 segments of TCP came while"),
@@ -278,6 +283,16 @@ def test_made_of_what_has_it(case: str) -> None:
 @pytest.mark.parametrize("case", HEALTHY)
 def test_not_made_of_the_healthy(case: str) -> None:
     assert diagnose(HEALTHY[case]) == []
+
+
+def test_a_note_is_told_as_one_and_last() -> None:
+    of = replace(config(), time_base=0xFFFFFF)
+    noted = replace(of, stations=(replace(of.stations[0], phasors=(PhasorChannel("V", 756),)),))
+    found = diagnose(Scene(stream(600, of=noted), clock()))
+    assert [(diagnosis.id, diagnosis.level) for diagnosis in found] == [
+        ("odd-time-base", "finding"),
+        ("idle-scale", "note"),
+    ]
 
 
 def test_every_row_has_a_case() -> None:
@@ -315,6 +330,9 @@ def test_every_row_has_a_case() -> None:
         ("concentrator", SICK["odd-time-base"][0]),
         ("zero-scale", Scene(quirky(analogs=(AnalogChannel("P", 0),)), clock())),
         ("zero-scale", Scene(quirky(format=Format(0), phasors=(PhasorChannel("V", 100),)), clock())),
+        ("idle-scale", Scene(quirky(format=Format(0), phasors=(PhasorChannel("V", 756),)), clock())),
+        ("idle-scale", Scene(quirky(analogs=(AnalogChannel("P", 1),)), clock())),
+        ("idle-scale", Scene(quirky(format=Format(2), analogs=(AnalogChannel("P", 5),)), clock())),
         ("tcp-losses", Scene(with_events(retransmits=3), clock())),
         ("two-senders", Scene(with_events(senders=1), clock())),
         ("reconnects", Scene(with_events(connects=1), clock())),
