@@ -53,6 +53,13 @@ PROGRESS_NS = NS // 2
     metavar="S",
     help="A line every S seconds in intervals.jsonl.",
 )
+@click.option(
+    "--clock-uncertainty",
+    "clock_bound_ns",
+    type=Parsed(parsers.milliseconds_ns),
+    metavar="MS",
+    help="You vouch that the clock of the recording was within so much of UTC.",
+)
 @click.option("--ledger", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="A player's truth.")
 @click.option("--compare", "before", type=click.Path(path_type=Path), metavar="DIR", help="An earlier run.")
 @click.option("--export-profile", "profile", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE")
@@ -98,6 +105,7 @@ class Asked:
     out: Path
     wait_ns: int
     interval_ns: int | None
+    clock_bound_ns: int | None
     ledger: Path | None
     before: Path | None
     profile: Path | None
@@ -122,6 +130,8 @@ def _check(asked: Asked) -> None:
         raise SettingsError("what is to be measured? name URLs, a recording, or --ini FILE")
     if asked.shown and asked.ini is None and not is_live(targets[0]):
         raise SettingsError(f"--live shows live streams; {targets[0]} is a recording: leave it out")
+    if asked.clock_bound_ns is not None and (asked.ini is not None or is_live(targets[0])):
+        raise SettingsError("--clock-uncertainty is for recordings; live, the clock itself is asked (see pmu clock)")
     if len({is_live(target) for target in targets}) > 1:
         raise SettingsError(f"{targets[0]} and {targets[-1]}: live streams or recordings, not both at once")
     if asked.no_samples and asked.ledger is not None:
@@ -141,6 +151,7 @@ def _settings(asked: Asked) -> Settings:
         wait_ns=asked.wait_ns,
         samples=not asked.no_samples,
         interval_ns=asked.interval_ns,
+        clock_bound_ns=asked.clock_bound_ns,
         ledger=asked.ledger,
         before=None if asked.before is None else load_summary(asked.before),
         requirements=parse_requirements(asked.require) if asked.require is not None else (),

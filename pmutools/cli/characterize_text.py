@@ -26,10 +26,8 @@ def told(
     """The lines."""
     run, streams = summary["run"], summary["streams"]
     yield f"{run['source']}: {len(streams)} streams, {run['duration_s']:.1f} s from {run['begin'][:19]}Z"
-    if summary["clock"]["disciplined"]:
+    if summary["clock"]["disciplined"] or not summary["clock"]["samples"]:  # else it is among the diagnoses
         yield summary["clock"]["text"]
-    elif not summary["clock"]["samples"]:
-        yield "a recording does not say how good its clock was: delays hold its offset, differences of delays do not"
     yield ""
     shown = streams if all_of_them else worst(streams)
     every = [*shown]

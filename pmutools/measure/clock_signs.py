@@ -37,7 +37,7 @@ def _negative(scene: Scene) -> str | None:
         return None
     share = delays.negative / delays.delay.count
     whose = "the sender's clock is ahead"
-    if not scene.clock.last.disciplined:
+    if scene.clock.bound_ns is None:
         whose += ", or the receiver's, which is not disciplined, is behind"
     return (
         f"{share:.1%} of the delays are below zero, down to {ms_text(delays.delay.min_ns)}: {whose}; they are "

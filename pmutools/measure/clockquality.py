@@ -26,13 +26,16 @@ class ClockQuality:
     chrony: ChronyClock | None = None
     ptp: PtpClock | None = None
     gps: GpsClock | None = None
+    vouched_ns: int | None = None
+    """The user's word for it, of a clock that cannot be asked any more."""
 
     @property
     def bound_ns(self) -> int | None:
         """How wrong the clock may be; None where nobody can tell.
 
-        Who disciplines the clock knows best: PTP, then chrony; then who has compared it with a pulse; then the
-        kernel's own figure. A source that promises nothing leaves the word to the next.
+        The user's word goes before all. Else who disciplines the clock knows best: PTP, then chrony; then who has
+        compared it with a pulse; then the kernel's own figure. A source that promises nothing leaves the word to the
+        next.
         """
         return self._promised()[1]
 
@@ -52,7 +55,8 @@ class ClockQuality:
                 f"receiver clock not disciplined ({self._why_not()}); "
                 "delays hold its unknown offset, differences of delays do not"
             )
-        return f"receiver clock within {bound_ns / _MS:.3g} ms of UTC, by {self.source}"
+        by = "by the word of the user" if self.vouched_ns is not None else f"by {self.source}"
+        return f"receiver clock within {bound_ns / _MS:.3g} ms of UTC, {by}"
 
     @property
     def short(self) -> str:
@@ -82,6 +86,8 @@ class ClockQuality:
         return {"kernel": self.kernel, "chrony": self.chrony, "ptp": self.ptp, "gps": self.gps}
 
     def _promised(self) -> tuple[str, int | None]:
+        if self.vouched_ns is not None:
+            return "user", self.vouched_ns
         asked = (("ptp", self.ptp), ("chrony", self.chrony), ("gps", self.gps), ("kernel", self.kernel))
         for name, part in asked:
             bound = None if part is None else part.bound_ns
@@ -148,9 +154,12 @@ NOTES: tuple[Callable[[ClockQuality], str | None], ...] = (_leap, _smear, _tai, 
 """Each gives a text where it applies."""
 
 
+RECORDED = "a recording does not say how good its clock was"
+
+
 @dataclass
 class ClockLog:
-    """The receiver's clock over a run: the last word, and the worst."""
+    """The receiver's clock over a run: the last word, and the worst. Without samples it is that of a recording."""
 
     last: ClockQuality = field(default_factory=ClockQuality)
     samples: int = 0
@@ -179,13 +188,23 @@ class ClockLog:
         """The worst bound of the run; None where there was none, or for some time."""
         return None if self.undisciplined or not self.samples else self.worst_ns
 
+    @property
+    def why(self) -> str:
+        """Whose word :attr:`bound_ns` is, or why there is none."""
+        return self.last.text if self.samples else RECORDED
+
     def to_json(self) -> dict[str, Any]:
         from pmutools.measure.histogram import ms
 
-        return self.last.to_json() | {
-            "samples": self.samples,
-            "undisciplined_samples": self.undisciplined,
-            "worst_bound_ms": ms(self.bound_ns),
-            "steps": self.steps,
-            "largest_step_ms": ms(self.largest_step_ns),
-        }
+        unasked = {"text": f"{RECORDED}: delays hold its offset, differences of delays do not"}
+        return (
+            self.last.to_json()
+            | ({} if self.samples else unasked)
+            | {
+                "samples": self.samples,
+                "undisciplined_samples": self.undisciplined,
+                "worst_bound_ms": ms(self.bound_ns),
+                "steps": self.steps,
+                "largest_step_ms": ms(self.largest_step_ns),
+            }
+        )

@@ -95,8 +95,8 @@ def stream_summary(
 ) -> dict[str, Any]:
     """One stream's part; ``departures`` are what the sender's ledger tells of it."""
     counts, identity = result.counts, result.identity
-    sure = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns)
-    locked = uncertainty(clock.bound_ns, clock.last.text, counts.quality, result.period_ns, locked=True)
+    sure = uncertainty(clock.bound_ns, clock.why, counts.quality, result.period_ns)
+    locked = uncertainty(clock.bound_ns, clock.why, counts.quality, result.period_ns, locked=True)
     fitted_to, of = typical(counts.delays)
     fitted = best_fit(fitted_to) if fit else None
     skew = None if result.clock_steps else result.floor.drift()
@@ -128,6 +128,7 @@ def stream_summary(
             "wait_ms": ms(result.wait_ns),
             "tmax_s": result.horizon_ns / timebase.NS,
             "uncertainty": sure.to_json(),
+            "uncertainty_reason": sure.reason,
             "uncertainty_locked_ms": ms(locked.bound_ns),
             "skew_ppm": skew.ppm if skew else None,
             "delay_correlation": counts.delays.correlation,

@@ -53,6 +53,11 @@ class Uncertainty:
         known = [part.bound_ns for part in self.parts if part.bound_ns is not None]
         return sum(known) if len(known) == len(self.parts) else None
 
+    @property
+    def reason(self) -> str | None:
+        """Why there is no sum; None where there is one."""
+        return "; ".join(f"{part.name}: {part.why}" for part in self.parts if part.bound_ns is None) or None
+
     def told(self, delay_ns: float) -> str:
         """A delay as it should be printed."""
         value = f"{delay_ns / NS_PER_MS:.4g} ms"

@@ -151,7 +151,7 @@ def _clock_facts(view: View) -> list[tuple[str, str]]:
         ("Receiver", clock["text"]),
         ("Worst bound of the run", "unknown" if worst is None else f"± {worst:.3g} ms"),
     ]
-    if clock["samples"]:
+    if clock["samples"] and clock["source"] != "user":
         asked = f"{plural(clock['samples'], 'time')}, {count(clock['undisciplined_samples'])} without a bound"
         facts.append(("Asked", asked))
     facts += [("Note", note) for note in clock.get("notes", ())]
@@ -175,10 +175,9 @@ def _uncertainty(view: View) -> list[str]:
             f"Every delay{whose} is told to ± {low if low == high else f'{low} to {high}'} ms, worst case."
         )
     if unknown:
-        parts = [part for part in unknown[0].told["uncertainty"]["parts"] if part["bound_ms"] is None]
-        why = "; ".join(f"{part['name']}: {part['why']}" for part in parts)
         names = listed([stream.label for stream in unknown])
-        sentences.append(f"Nobody can say how wrong the delays of {names} are ({why}).")
+        why = unknown[0].told["uncertainty_reason"]
+        sentences.append(f"Nobody can say how wrong the delays of {names} are ({why}): they have no ±.")
     if timed:
         sentences.append("Offsets of clocks cancel in IPDV, PDV, inter-arrival times and jitter.")
     return sentences

@@ -320,6 +320,35 @@ def test_real_captures_are_told_in_words_without_any_option(name: str, tmp_path:
         assert diagnosis["text"] in result.out
 
 
+# --- the clock of a recording
+
+
+def test_a_recording_has_no_uncertainty_and_says_why(tmp_path: Path) -> None:
+    write(tmp_path / "a.pcap", recording(stream(), 300, latency_ns=jittery))
+    result, told = characterized(tmp_path / "a.pcap", tmp_path / "run")
+    (found,) = told["streams"]
+    why = "a recording does not say how good its clock was"
+    assert found["uncertainty_ms"] is None
+    assert found["uncertainty_reason"] == f"receiver clock: {why}"
+    assert told["clock"]["text"].startswith(f"{why}: delays hold its offset")
+    assert told["clock"]["text"] in result.out
+    assert "unknown" in result.out
+
+
+def test_the_user_may_vouch_for_the_clock_of_a_recording(tmp_path: Path) -> None:
+    write(tmp_path / "a.pcap", recording(stream(), 300, latency_ns=jittery))
+    asked = ("--clock-uncertainty", "0.5", "--interval", "1", "--require", "uncertainty<=1ms")
+    result, told = characterized(tmp_path / "a.pcap", tmp_path / "run", *asked)
+    (found,) = told["streams"]
+    assert result.code == 0
+    assert found["uncertainty_ms"] == pytest.approx(0.5 + 0.1 + 0.001)  # and the arrival stamp, and a locked sender
+    assert found["uncertainty_reason"] is None
+    assert (told["clock"]["source"], told["clock"]["worst_bound_ms"]) == ("user", 0.5)
+    assert "receiver clock within 0.5 ms of UTC, by the word of the user" in result.out
+    lines = [json.loads(line) for line in (tmp_path / "run" / "intervals.jsonl").read_text().splitlines()]
+    assert [line["streams"][0]["uncertainty_ms"] for line in lines] == [pytest.approx(0.601)] * len(lines)
+
+
 # --- what cannot be done
 
 
@@ -329,6 +358,8 @@ def test_real_captures_are_told_in_words_without_any_option(name: str, tmp_path:
         ((), 2, "what is to be measured?"),
         (("a.pcap", "--ini", "b.ini"), 2, "measure one or the other"),
         (("udp://127.0.0.1:1", "a.pcap"), 2, "not both at once"),
+        (("udp://127.0.0.1:1", "--clock-uncertainty", "1"), 2, "live, the clock itself is asked"),
+        (("a.pcap", "--clock-uncertainty", "-1"), 2, "'--clock-uncertainty': -1 is out of range"),
         (("a.pcap", "--no-samples", "--ledger", "t.parquet"), 2, "leave out --no-samples"),
         (("a.pcap", "--require", "speed<=1"), 2, "is nothing that is measured"),
         (("a.pcap", "--require", ""), 2, "an empty limit"),

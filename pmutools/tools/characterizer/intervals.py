@@ -75,12 +75,17 @@ class Intervals:
 
     def _take(self, gauge: Gauge, number: int) -> None:
         self._engine.settle(gauge)
-        self._waiting.setdefault(number, _Line()).add(gauge, gauge.meter.take_interval(), None)
+        self._waiting.setdefault(number, _Line()).add(gauge, gauge.meter.take_interval(), self._clock)
 
     def _write_up_to(self, last: int) -> None:
         for number in sorted(number for number in self._waiting if number <= last):
             begin_ns = number * self.period_ns
-            self._write(self._waiting.pop(number), begin_ns, begin_ns + self.period_ns, None)
+            self._write(self._waiting.pop(number), begin_ns, begin_ns + self.period_ns, self._clock)
+
+    @property
+    def _clock(self) -> ClockQuality | None:
+        """That of the recording, if the user vouches for it."""
+        return self._engine.clock.last if self._engine.clock.samples else None
 
     def _write(self, line: _Line, begin_ns: int, end_ns: int, clock: ClockQuality | None) -> None:
         drops, self._drops = self._engine.host.own_drops - self._drops, self._engine.host.own_drops

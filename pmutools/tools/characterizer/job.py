@@ -65,6 +65,8 @@ class Settings:
     requirements: Sequence[Requirement] = ()
     profile: Path | None = None
     exact_profile: bool = False
+    clock_bound_ns: int | None = None
+    """How wrong the clock of a recording was at most, if the user vouches for it."""
     round_ns: int = ROUND_NS
 
 
@@ -141,6 +143,8 @@ class Job:
     def recorded(self, source: Source, observe: Observe = unobserved, stop: Callable[[], bool] = lambda: False) -> None:
         """Measure a recording to its end, or until ``stop``; the time is that of its arrivals, or stamps."""
         self._extra = lambda: _bytes_of(source) | {"defects": source.defects()}
+        if (bound_ns := self._settings.clock_bound_ns) is not None:
+            self.engine.sample_clock(ClockQuality(vouched_ns=bound_ns))
         recorder = self._record(live=False)
         for items in groups(source.blocks()):
             self.engine.take(items)
