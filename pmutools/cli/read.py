@@ -30,13 +30,13 @@ MANY_TABLES = 64
 
 
 def _fields(text: str) -> Any:
-    from pmutools.formats.fields import parse_fields  # which needs numpy
+    from pmutools.formats.fields import parse_fields
 
     return parse_fields(text)
 
 
 def _split(text: str) -> Any:
-    from pmutools.tools.reader.rolling import parse_split
+    from pmutools.tools.reader.split import parse_split
 
     return parse_split(text)
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from pmutools.c37118.framer import SkipReason
 from pmutools.cli.shell import Exit, Talk
 from pmutools.errors import SourceError
 
@@ -83,6 +82,8 @@ def report(
 
 def _skipped(reason: str, nbytes: int, reading: Reading, recorder: Recorder) -> str:
     """Bytes that could not be decoded, and what became of frames for which only a configuration was missing."""
+    from pmutools.c37118.framer import SkipReason
+
     frames, kept = reading.undecoded, recorder.undecoded
     if reason != SkipReason.NO_CONFIG or not frames:
         return f"{nbytes} bytes skipped: {reason}"

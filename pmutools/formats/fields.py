@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 
-from pmutools.formats.columns import FRAME_COLUMNS
 from pmutools.parsers import words
 
 NAMED_COLUMNS = 8
@@ -37,6 +36,8 @@ class Fields:
     @property
     def of_frames_only(self) -> bool:
         """Whether nothing but columns of the frame itself is named."""
+        from pmutools.formats.columns import FRAME_COLUMNS  # with numpy, and an option is read before sockets are bound
+
         return all(item in FRAME_COLUMNS for item in self.items)
 
 
@@ -50,6 +51,8 @@ def parse_fields(text: str) -> Fields:
 
 def no_such_column(item: str, names: Collection[str]) -> str:
     """That no column fits an item, and which come near it."""
+    from pmutools.formats.columns import FRAME_COLUMNS
+
     near = get_close_matches(item, names, 3, 0.5)
     if near:
         return f"no column fits {item!r}; did you mean {' or '.join(map(repr, near))}?"

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from pmutools.c37118.config import StreamConfig
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import FLOWS, DataRun, Loss, Message
 from pmutools.clock import Clock, SystemClock
 from pmutools.flow import Chunk, Flow
-from pmutools.formats.source import Block, Gatherer, gather
 from pmutools.host import ClockStep, Heartbeat, HostLog, Stall
 from pmutools.net.dialogue import LinkEvent
 from pmutools.net.endpoint import Endpoint, parse_endpoint
@@ -20,7 +20,9 @@ from pmutools.net.receiver import Receivers
 from pmutools.net.sockets import RCVBUF_BYTES
 from pmutools.net.tcp import TcpCounts
 from pmutools.sites import Site
-from pmutools.tools.recordings import saved_configs
+
+if TYPE_CHECKING:
+    from pmutools.formats.source import Block, Gatherer  # they bring numpy: sockets are bound before that
 
 POLL_NS = 100_000_000
 """How often a silent reader looks at the time."""
@@ -65,7 +67,7 @@ class LiveSource:
         endpoints = [_endpoint(url) for url in urls]
         self.path = Path(str(endpoints[0]) if len(endpoints) == 1 else f"{len(endpoints)} endpoints")
         self.clock = clock or SystemClock()
-        saved = (*configs, *saved_configs(site for site in self.sites if site is not None))
+        saved = (*configs, *_saved(self.sites))
         self.receivers = Receivers(endpoints, self.clock, configs=saved, want_cfg3=want_cfg3, rcvbuf_bytes=rcvbuf_bytes)
         self.tally = self.receivers.demux.tally
         self._owners: dict[tuple[Flow, int], tuple[int, ...]] = {}
@@ -111,6 +113,8 @@ class LiveSource:
         rules. A list is empty where nothing came, and comes early, with several blocks a stream, where there is much:
         no more than some :data:`ROUND_FRAMES` frames wait.
         """
+        from pmutools.formats.source import Gatherer
+
         gatherer = Gatherer()
         out: list[Block | Message | Loss] = []
         now_ns = self.clock.monotonic_ns()
@@ -202,6 +206,8 @@ class LiveSource:
             yield from found
 
     def blocks(self) -> Iterator[Block | Message | Loss]:
+        from pmutools.formats.source import gather
+
         return gather(self.items())
 
     def defects(self) -> dict[str, int]:
@@ -239,6 +245,16 @@ class LiveSource:
         for event in self.host.news():
             if self._tell_host is not None:
                 self._tell_host(event)
+
+
+def _saved(sites: Iterable[Site | None]) -> tuple[StreamConfig, ...]:
+    """The saved configurations that sites refer to: slow to read, and seldom there."""
+    chosen = [site for site in sites if site is not None and site.config]
+    if not chosen:
+        return ()
+    from pmutools.tools.recordings import saved_configs
+
+    return saved_configs(chosen)
 
 
 def _endpoint(url: str | Endpoint | Site) -> Endpoint:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -66,6 +68,47 @@ def test_a_reader_binds_before_it_imports_what_is_slow() -> None:
     run_pmu("--version")
     plain_s = time.monotonic() - began
     assert bound_s < plain_s + 0.5
+
+
+AT_THE_BIND = """
+import os, sys
+
+def look(event, given):
+    if event == "socket.bind":
+        slow = ("numpy", "pyarrow", "scapy", "mcap", "google", "rich", "scipy", "matplotlib", "plotly", "zstandard")
+        os.write(1, " ".join(name for name in slow if name in sys.modules).encode() + b"bound")
+        os._exit(0)
+
+sys.addaudithook(look)
+from pmutools.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "read --out x.parquet",
+        "read --out x.pcapng --live",
+        "read --out x.csv --fields time --split 1h",
+        "read --out x.csv --long --trigger freq<59.95",
+        "characterize --out run --live",
+        "characterize --out run --ledger x.parquet --require loss<=1%",
+    ],
+)
+@pytest.mark.parametrize("named", [False, True])
+def test_nothing_slow_is_imported_before_the_sockets_are_bound(options: str, named: bool, tmp_path: Path) -> None:
+    (tmp_path / "pmus.ini").write_text("[pmu N1]\nurl = udp://127.0.0.1:0\nidcode = 7\n")
+    where = ["--ini", "pmus.ini"] if named else ["udp://127.0.0.1:0"]
+    done = subprocess.run(
+        [sys.executable, "-c", AT_THE_BIND, *options.split(), *where],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("bound", "")
 
 
 def test_duration_counts_from_the_start(tmp_path: Path) -> None:

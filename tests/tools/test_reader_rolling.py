@@ -12,7 +12,8 @@ from support.reading import START_NS, Item, Rounds, rounds_of, stamps_in, stream
 from pmutools.formats import open_sink, open_source
 from pmutools.timebase import NS
 from pmutools.tools.reader import read
-from pmutools.tools.reader.rolling import Rolling, Split, parse_split
+from pmutools.tools.reader.rolling import Rolling
+from pmutools.tools.reader.split import Split, parse_split
 
 CONFIG = stream(7)
 SUFFIXES = (".csv", ".parquet", ".arrow", ".mcap", ".jsonl", ".pcapng", ".c37118", ".c37118.zst")

@@ -19,7 +19,8 @@ from pmutools.tools.reader import Reading, read
 from pmutools.tools.reader.conditions import parse_triggers
 from pmutools.tools.reader.log import Log
 from pmutools.tools.reader.ring import Ring, Window
-from pmutools.tools.reader.rolling import Rolling, Split
+from pmutools.tools.reader.rolling import Rolling
+from pmutools.tools.reader.split import Split
 from pmutools.tools.reader.watch import Watch
 
 BYTES = (".pcapng", ".pcap", ".mcap", ".c37118", ".c37118.gz")

@@ -20,7 +20,8 @@ from pmutools.tools.live import LiveSource
 from pmutools.tools.reader.conditions import Condition
 from pmutools.tools.reader.log import Log, Recorder
 from pmutools.tools.reader.ring import WINDOW, Ring, Window
-from pmutools.tools.reader.rolling import Rolling, Split
+from pmutools.tools.reader.rolling import Rolling
+from pmutools.tools.reader.split import Split
 from pmutools.tools.reader.watch import Watch
 
 
