@@ -38,6 +38,8 @@ _PX = 100
 _MS_PER_DAY = 86_400_000
 _DASHES: dict[Dash, Any] = {Dash.SOLID: "-", Dash.DASHED: (0, (5, 3)), Dash.DOTTED: (0, (1, 2))}
 _SYMBOLS = {"circle": "o", "square": "s", "diamond": "D", "bar": "|", "cross": "x"}
+_EASTERN = ("Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans JP", "Source Han Sans", "WenQuanYi Zen Hei", "IPAGothic")
+"""Fonts with Chinese and Japanese letters, of which many machines have one: stations may be called so."""
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.edgecolor": theme.MUTED,
@@ -70,7 +72,7 @@ def save(figure: Figure, folder: Path) -> list[Path]:
     from matplotlib.figure import Figure as Sheet
 
     paths = [folder / f"{figure.name}.{kind}" for kind in ("png", "svg")]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(_STYLE | {"font.family": _families()}):
         size = ((theme.WIDE_PX if figure.wide else theme.HALF_PX) / _PX, figure.height_px / _PX + 0.3)
         sheet = Sheet(figsize=size, facecolor=theme.PAPER)
         FigureCanvasAgg(sheet)
@@ -81,6 +83,14 @@ def save(figure: Figure, folder: Path) -> list[Path]:
             sheet.savefig(paths[0], dpi=DPI, metadata=metadata, pil_kwargs={"compress_level": 3})
             sheet.savefig(paths[1], metadata=metadata | {"Date": None, "Creator": "pmutools"})
     return paths
+
+
+def _families() -> list[str]:
+    """The usual font, and those that stand in for letters which it lacks, as far as this machine has them."""
+    from matplotlib.font_manager import fontManager
+
+    installed = {font.name for font in fontManager.ttflist}
+    return ["sans-serif", *(name for name in _EASTERN if name in installed)]
 
 
 def _draw(figure: Figure, sheet: Any, size: tuple[float, float]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +76,14 @@ def test_receiving_is_measured_over_udp_and_tcp() -> None:
         assert cost.frames > 0
         assert 0 < cost.cpu_s < cost.wall_s * 2
         assert cost.us > 0
+
+
+def test_what_is_not_installed_is_one_line() -> None:
+    program = Path(__file__).with_name("run.py")
+    done = subprocess.run([sys.executable, "-I", "-S", program, "--quick"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("bench: not installed: pmutools, pytest, synchrophasor, pyc37, fastcrc; pip install")
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_ratio_is_that_of_the_rounds() -> None:

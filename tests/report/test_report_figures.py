@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args
@@ -117,6 +118,17 @@ def test_all_is_written_and_nothing_is_blank(tmp_path: Path) -> None:
             assert picture.shape[0] > 100 and len(colours) > 20, path
         else:
             ET.parse(path)
+
+
+def test_letters_that_the_usual_font_lacks_come_from_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Chinese ones where a machine has a font for them; this font comes with matplotlib, and has this letter."""
+    titled = replace(figure(Rule("a rule", 3.0, theme.VERMILION)), x=Axis("\N{SCRIPT SMALL G}" * 20))
+    drawn = []
+    for number, names in enumerate([(), ("No Such Font", "STIXGeneral")]):
+        monkeypatch.setattr(matplotlib_figures, "_EASTERN", names)
+        (tmp_path / str(number)).mkdir()
+        drawn.append(matplotlib_figures.save(titled, tmp_path / str(number))[0])
+    assert different(*drawn) > 200
 
 
 def test_a_silence_is_a_gap_and_shaded() -> None:
