@@ -66,7 +66,7 @@ def report(
         click.echo(json.dumps(told))
     talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
     for reason, nbytes in reading.skipped.items():
-        talk.say(f"  {_skipped(reason, nbytes, reading, recorder)}")
+        talk.say(f"  {_skipped(reason, nbytes, reading, recording, recorder.undecoded)}")
     for place, name in source.silent[:SHOWN_SILENT] if reading.frames else ():
         talk.say(f"  {name}: no data: {stage.reasons.why(place)}")
     if reading.own_drops:
@@ -80,18 +80,20 @@ def report(
     return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
 
 
-def _skipped(reason: str, nbytes: int, reading: Reading, recorder: Recorder) -> str:
-    """Bytes that could not be decoded, and what became of frames for which only a configuration was missing."""
+def _skipped(reason: str, nbytes: int, reading: Reading, recording: Recording, kept: int) -> str:
+    """Bytes that could not be decoded; where only a configuration was missing, the frames may be kept all the same."""
     from pmutools.c37118.framer import SkipReason
 
-    frames, kept = reading.undecoded, recorder.undecoded
-    if reason != SkipReason.NO_CONFIG or not frames:
+    if reason != SkipReason.NO_CONFIG or not reading.undecoded:
         return f"{nbytes} bytes skipped: {reason}"
-    fate = "not kept; a capture (.pcapng, .c37118, .mcap) keeps them undecoded"
-    if kept:
-        fate = "kept undecoded" if kept == frames else f"{kept} of them kept undecoded, the others in no event"
+    if kept == reading.undecoded:
+        fate = "kept undecoded"
+    elif recording.triggers:
+        fate = f"{kept} of them kept undecoded, the others are in no event"
+    else:
+        fate = "not kept; a capture (.pcapng, .c37118, .mcap) keeps them undecoded"
     done = "undecoded" if kept else "skipped"
-    return f"{nbytes} bytes {done}: {reason}: no configuration came for {frames} frames: {fate}"
+    return f"{nbytes} bytes {done}: {reason}: no configuration came for {reading.undecoded} frames: {fate}"
 
 
 def _paths_text(paths: Sequence[str]) -> str:
