@@ -25,3 +25,4 @@ def test_a_recording_gets_a_page_with_its_intervals_and_the_command(
     assert "Acceptable" in words and "Interval by interval" in words
     assert f"pmu characterize {PDC} --out {out}" in words and "'delay_p99<=1s'" in words
     assert (out / "figures" / "intervals.svg").exists()
+    assert "(receiver clock: a recording does not say how good its clock was): they have no ±." in words
