@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from dcon.cli.outputs import spare_in
 from pmutools.cli.shell import Exit, Talk, common
 
 
@@ -25,8 +26,10 @@ def command(sessions: tuple[str, ...], out: Path, as_json: bool, quiet: bool, ve
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: for matrices this small threads only cost
     from dcon.analysis.report import JSON, PAGE, main_findings, write_analysis
+    from pmutools.report.page import FIGURES
 
     talk = Talk(quiet, verbose)
+    spare_in(out, (PAGE, JSON, FIGURES), sessions)
     outcome = write_analysis(sessions, out, lambda name: talk.progress(f"reading {name}"))
     talk.progress("")
     if as_json:

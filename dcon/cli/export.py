@@ -6,6 +6,7 @@ import json
 
 import click
 
+from dcon.cli.outputs import spare
 from dcon.session.tables import TABLES
 from pmutools.cli.shell import Exit, Talk, common
 
@@ -25,6 +26,7 @@ def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, q
     from dcon.session.export import export
 
     talk = Talk(quiet, verbose)
+    spare(output, sessions)
     summary = export(sessions, output, table)
     if as_json:
         click.echo(json.dumps({"rows": summary.rows, "gaps": summary.gaps, "damage": summary.damage.lines()}))

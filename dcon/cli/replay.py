@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dcon.cli.outputs import spare
 from pmutools.cli.shell import Exit, Talk, common
-from pmutools.errors import SourceError
+from pmutools.errors import SettingsError, SourceError
 
 if TYPE_CHECKING:
     from dcon.core.values import Record
-    from dcon.session.replay import Observer
+    from dcon.session.replay import Driven, Observer
 
 TOLD_TICKS = 3600
 
@@ -36,14 +37,18 @@ def command(
     Exit code 3 says that something came out otherwise (without --set), or that the log could not be replayed whole.
     With --set the answer is what the controller would have commanded, not what the grid would have done.
     """
-    from dcon.session.replay import replay
+    from dcon.session.replay import NOT_THE_GRID, replay
 
     talk = Talk(quiet, verbose)
+    if out is not None:
+        spare(out, sessions)
+        if out.suffix.lower() == ".mcap":
+            raise SettingsError(f"--out {out}: commands are written as CSV; name it {out.with_suffix('.csv').name}")
     replayed = itertools.count(1)
     with _commands(out) as write:
 
-        def observe(recorded_mw: float, now: Record) -> None:
-            write(recorded_mw, now)
+        def observe(recorded: Driven, now: Record) -> None:
+            write(recorded, now)
             if (count := next(replayed)) % TOLD_TICKS == 0:
                 talk.progress(f"{count} ticks")
 
@@ -53,8 +58,9 @@ def command(
         click.echo(json.dumps(result.to_json()))
     elif changes:
         click.echo(
-            f"{result.ticks} ticks with {', '.join(changes)}: commands differ by up to {result.largest_mw:.3f} MW. "
-            "This is the command, not the grid: the recorded grid answered to the recorded command."
+            f"{result.ticks} ticks with {', '.join(changes)}: commands differ by up to "
+            f"{result.largest.command_mw:.3f} MW, probing signals by {result.largest.probe_mw:.3f} MW, outputs by "
+            f"{result.largest.output_v:.4f} V. {NOT_THE_GRID}"
         )
     elif result.different:
         click.echo(f"{result.different} of {result.ticks} ticks differ; first: {result.first}")
@@ -69,16 +75,21 @@ def command(
 
 @contextmanager
 def _commands(out: Path | None) -> Iterator[Observer]:
-    """Writes one row a tick to ``out``."""
+    """Writes one row a tick to ``out``, which is there whole or as it was."""
     if out is None:
-        yield lambda recorded_mw, now: None
+        yield lambda recorded, now: None
         return
-    try:
-        with out.open("w", encoding="ascii") as file:
-            file.write("tick_ns,recorded_command_mw,replayed_command_mw\n")
+    from dcon.session.replay import Driven
+    from pmutools.formats.output import whole
 
-            def write(recorded_mw: float, now: Record) -> None:
-                file.write(f"{now.tick_ns},{recorded_mw!r},{now.command_mw!r}\n")
+    columns = [f"{which}_{name}" for name in Driven._fields for which in ("recorded", "replayed")]
+    try:
+        with whole(out) as path, path.open("w", encoding="ascii") as file:
+            file.write(f"tick_ns,{','.join(columns)}\n")
+
+            def write(recorded: Driven, now: Record) -> None:
+                pairs = zip(recorded, Driven.of(now), strict=True)
+                file.write(f"{now.tick_ns},{','.join(f'{one!r},{other!r}' for one, other in pairs)}\n")
 
             yield write
     except SourceError:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dcon.cli.outputs import keep_sessions
 from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SourceError
 from pmutools.parsers import number
@@ -95,6 +96,7 @@ def command(
     sweep = runs(plan, axes, out)
     if out is not None:
         with _naming(out):
+            keep_sessions([run.path for run in sweep if run.path])
             out.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
     for number_, (run, outcome) in enumerate(

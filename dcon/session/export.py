@@ -15,6 +15,7 @@ from dcon.session.log import SessionReader
 from dcon.session.parts import Paths
 from dcon.session.tables import TABLES, Column, Row, Table
 from pmutools.errors import SettingsError, SourceError
+from pmutools.formats.output import whole
 from pmutools.schema.log_reader import Damage
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> 
     """Write one table of a session log to ``out``: ``.csv .parquet .arrow .jsonl``, text also ``.gz`` or ``.zst``.
 
     Raises SettingsError for a table or suffix that is not known, SourceError where either file cannot be used or (for
-    ``tick``) the log holds no tick: ``out`` is then not written.
+    ``tick``) the log holds no tick: ``out`` is then as it was.
     """
     if table not in TABLES:
         raise SettingsError(f"no table {table!r}; there are {', '.join(TABLES)}")
@@ -54,7 +55,7 @@ def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> 
     metadata = {"table": table, "flags": json.dumps(reader.flags), "session": json.dumps(reader.metadata)}
     count = 0
     try:
-        with sink(Path(out), columns, metadata) as write:
+        with whole(Path(out)) as path, sink(path, columns, metadata) as write:
             while first is not None:
                 write(first)
                 count += len(first)

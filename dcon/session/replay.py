@@ -15,7 +15,7 @@ import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import pmutools
 from dcon.core.values import Order, Record
@@ -31,8 +31,25 @@ from pmutools.errors import SourceError, WireError
 from pmutools.flow import StampSource
 from pmutools.schema.pmu_log import PmuFrame
 
-Observer = Callable[[float, Record], None]
-"""(command_mw as recorded, the record of the tick now)."""
+NOT_THE_GRID = "This is the command, not the grid: the recorded grid answered to the recorded command."
+"""What is to be said of a replay with changed settings."""
+
+
+class Driven(NamedTuple):
+    """What a tick commanded and drove: fields of a :class:`~dcon.core.values.Record`, or how far they changed."""
+
+    command_mw: float = 0.0
+    probe_mw: float = 0.0
+    output_v: float = 0.0
+
+    @classmethod
+    def of(cls, tick: Any) -> Driven:
+        """Of a record, or of the message of a tick."""
+        return cls(tick.command_mw, tick.probe_mw, tick.output_v)
+
+
+Observer = Callable[[Driven, Record], None]
+"""(what was recorded, the record of the tick now)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +117,8 @@ class Replay:
     stopped: str = ""
     problems: list[str] = field(default_factory=list)
     """Configurations that could not be used, in words."""
-    largest_mw: float = 0.0
-    """Largest change of ``command_mw``."""
+    largest: Driven = field(default_factory=Driven)
+    """Largest change of each."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -111,7 +128,10 @@ class Replay:
             "changes": list(self.changes),
             "stopped": self.stopped or None,
             "problems": self.problems,
-            "largest_command_change_mw": self.largest_mw,
+            "largest_command_change_mw": self.largest.command_mw,
+            "largest_probe_change_mw": self.largest.probe_mw,
+            "largest_output_change_v": self.largest.output_v,
+            "note": NOT_THE_GRID if self.changes else None,
         }
 
 
@@ -144,7 +164,10 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
             break
         now = _again(engine, group, result)
         result.ticks += 1
-        result.largest_mw = max(result.largest_mw, abs(now.record.command_mw - logged.command_mw))
+        recorded, driven = Driven.of(logged), Driven.of(now.record)
+        if recorded != driven:
+            changes_now = (abs(one - other) for one, other in zip(recorded, driven, strict=True))
+            result.largest = Driven(*map(max, result.largest, changes_now))
         if not _same_bytes(group, now, reader.instances, frames=not changes):
             try:
                 tick = logged_tick(group)
@@ -156,7 +179,7 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
                 result.different += 1
                 result.first = result.first or Difference(group.tick_ns, *found, before, tick.frames, tick.orders)
         if observe is not None:
-            observe(logged.command_mw, now.record)
+            observe(recorded, now.record)
         before = (
             f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
             f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"

@@ -36,6 +36,26 @@ def cannot_write(path: Path, error: OSError) -> SourceError:
     return SourceError(f"cannot write {path}: {error.strerror or error}; {remedy}")
 
 
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that is to be there whole or not at all: beside ``path``, which it becomes at the end.
+
+    The name has the same suffix. What is no regular file (a pipe, ``/dev/stdout``) is written as it stands, and a link
+    stays one. OSErrors are the caller's to word.
+    """
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    target = Path(os.path.realpath(path))
+    part = target.with_name(f".part.{target.name}")
+    try:
+        yield part
+        os.replace(part, target)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
 class OutputFile(io.RawIOBase):
     """A file being written, compressed where its name ends in ``.gz`` or ``.zst``; ``-`` is standard output.
 

@@ -74,13 +74,16 @@ def test_a_simulated_session_replays_bit_for_bit(session: Path, capsys: Capsys) 
         "stopped": None,
         "problems": [],
         "largest_command_change_mw": 0.0,
+        "largest_probe_change_mw": 0.0,
+        "largest_output_change_v": 0.0,
+        "note": None,
     }
 
 
 def test_the_records_are_those_of_the_log(session: Path) -> None:
     ticks = list(SessionReader(session).ticks())
     seen: list[Record] = []
-    replay(session, observe=lambda recorded_mw, now: seen.append(now))
+    replay(session, observe=lambda recorded, now: seen.append(now))
     assert len(seen) == len(ticks)
     assert all(identical(tick.record, now) for tick, now in zip(ticks, seen, strict=True))
     assert max(abs(tick.record.command_mw) for tick in ticks) > 30  # there was something to get wrong
@@ -214,7 +217,25 @@ def test_settings_can_be_changed(session: Path, tmp_path: Path, capsys: Capsys) 
     for row in rows[310:330]:  # the brake is in: half the gain is half the command
         assert float(row["replayed_command_mw"]) == pytest.approx(float(row["recorded_command_mw"]) / 2, rel=1e-9)
     code, out, _ = told(capsys, str(session), "--set", "controller.gain_mw_per_mhz=12")
-    assert code == 0 and "differ by up to 0.000 MW" in out
+    assert code == 0 and "differ by up to 0.000 MW, probing signals by 0.000 MW, outputs by 0.0000 V" in out
+
+
+def test_a_change_of_the_probing_signal_is_seen(tmp_path: Path, capsys: Capsys) -> None:
+    path, table = tmp_path / "probed.mcap", tmp_path / "commands.csv"
+    simulate(Plan("square-pulse", duration_s=8.0, control=False), str(path))
+    change = ("--set", "probing.amplitude_mw=50")
+    code, out, _ = told(capsys, str(path), *change, "--out", str(table))
+    assert code == 0
+    assert "commands differ by up to 0.000 MW, probing signals by 75.000 MW, outputs by 6.0000 V. This is the" in out
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    for which, largest in (("recorded", 125), ("replayed", 50)):
+        assert max(abs(float(row[f"{which}_probe_mw"])) for row in rows) == largest
+        assert max(abs(float(row[f"{which}_output_v"])) for row in rows) == largest / 12.5
+    code, out, _ = told(capsys, str(path), *change, "--json")
+    found = json.loads(out)
+    assert (code, found["largest_command_change_mw"]) == (0, 0.0)
+    assert found["largest_probe_change_mw"] == pytest.approx(75.0)
+    assert found["largest_output_change_v"] == pytest.approx(6.0) and "not the grid" in found["note"]
 
 
 @pytest.mark.parametrize(
