@@ -14,7 +14,7 @@ import click
 from dcon.cli.outputs import keep_sessions
 from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SourceError
-from pmutools.parsers import number
+from pmutools.parsers import integer, number
 
 if TYPE_CHECKING:
     from dcon.sim.simulate import Outcome
@@ -23,11 +23,20 @@ if TYPE_CHECKING:
 RESULT = "result.json"
 
 
+def _rate(text: str) -> int:
+    from dcon.sim.plan import RATES
+
+    if (rate := integer()(text)) not in RATES:
+        raise ValueError(f"{text} is not one of {', '.join(map(str, RATES))} frames/s")
+    return rate
+
+
 @click.command(name="simulate", short_help="A scenario in virtual time, through the same bytes and the same engine.")
 @click.argument("scenario_name", metavar="SCENARIO")
 @click.option("--plant", default="modal", show_default=True, metavar="NAME")
 @click.option("--gain", type=Parsed(number(0, 100)), default=9.0, show_default=True, metavar="K", help="MW/mHz.")
 @click.option("--delay", type=Parsed(number(0, 2000)), default=82.0, show_default=True, metavar="MS", help="Total.")
+@click.option("--rate", type=Parsed(_rate), default=60, show_default=True, metavar="FPS", help="Of every PMU.")
 @click.option("--deadband", type=Parsed(number(0, 100)), default=0.0, show_default=True, metavar="MHZ")
 @click.option("--noise", type=Parsed(number(0, 100)), default=0.0, metavar="MRAD", help="Angle noise of every PMU.")
 @click.option("--fault", "faults", multiple=True, metavar="NAME", help="A fault of the paper; repeatable.")
@@ -50,6 +59,7 @@ def command(
     plant: str,
     gain: float,
     delay: float,
+    rate: int,
     deadband: float,
     noise: float,
     faults: tuple[str, ...],
@@ -82,6 +92,7 @@ def command(
         plant=plant,
         gain_mw_per_mhz=gain,
         delay_ms=delay,
+        rate_hz=rate,
         deadband_mhz=deadband,
         faults=faults,
         profile=Profile() if impair is None else load_profile(impair),
@@ -156,7 +167,8 @@ def _rows(run: Run, outcome: Outcome, axes: list[Axis]) -> list[str]:
 def _text(outcome: Outcome) -> str:
     plan = outcome.plan
     lines = [f"{plan.scenario} on {plan.plant}, {plan.length_s:g} s: {plan.course.text}"]
-    lines.append(f"  K {plan.gain_mw_per_mhz:g} MW/mHz, total delay {plan.delay_ms:g} ms, seed {plan.seed}")
+    rate = f", {plan.rate_hz} frames/s" if plan.rate_hz != 60 else ""
+    lines.append(f"  K {plan.gain_mw_per_mhz:g} MW/mHz, total delay {plan.delay_ms:g} ms{rate}, seed {plan.seed}")
     for name, mode in (("open loop", outcome.open_loop), ("closed loop", outcome.mode)):
         if mode is not None:
             lines.append(f"  {name:<12} {mode.frequency_hz:.4f} Hz  {mode.damping_percent:6.2f} %  (R² {mode.r2:.4f})")

@@ -14,6 +14,10 @@ from pmutools.impair.profile import Profile
 
 START_NS = timebase.parse_utc("2024-01-01T00:00:00Z")
 FIRST_PORT = 4801
+NOMINAL_HZ = 60.0
+"""Of the grid, whatever the rate of its PMUs."""
+RATES = (30, 50, 60, 100, 120)
+"""Frames per second that PMUs report at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +41,7 @@ class Plan:
     noise_rad: float = 0.0
     seed: int = 1
     rate_hz: int = 60
+    """Frames per second of every PMU; the controller's filter is designed for it."""
 
     @property
     def course(self) -> Scenario:

@@ -21,8 +21,7 @@ from dcon.session.log import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
 from dcon.sim.operator import EagerOperator
-from dcon.sim.plan import START_NS, Plan, ini_of
-from dcon.sim.wire import Wire
+from dcon.sim.plan import NOMINAL_HZ, START_NS, Plan, ini_of
 from pmutools import timebase
 from pmutools.c37118 import Frame
 from pmutools.errors import SettingsError
@@ -74,6 +73,7 @@ class Outcome:
             "plant": plan.plant,
             "gain_mw_per_mhz": plan.gain_mw_per_mhz,
             "delay_ms": plan.delay_ms,
+            "rate_hz": plan.rate_hz,
             "seed": plan.seed,
             "duration_s": plan.length_s,
             "mode": None if self.mode is None else self.mode._asdict(),
@@ -92,8 +92,7 @@ class _Sender:
 
     def __init__(self, pmu: PmuModel, plan: Plan, profile: Profile) -> None:
         self.pmu = pmu
-        self.stream = EmulatedStream([pmu], plan.rate_hz)
-        self.wire = Wire(pmu.name, self.stream.config)
+        self.stream = EmulatedStream([pmu], plan.rate_hz, nominal_hz=NOMINAL_HZ)
         names = (str(pmu.idcode), pmu.bus)
         self.pipeline = Pipeline(profile, pmu.name, plan.seed, config=self.stream.config, aliases=names)
 

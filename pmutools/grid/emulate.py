@@ -27,10 +27,15 @@ def station_of(pmu: PmuModel, *, nominal_hz: float = 60.0) -> Station:
 class EmulatedStream:
     """One stream: a PMU, or several PMUs in the frames of one concentrator."""
 
-    def __init__(self, pmus: Sequence[PmuModel], rate: int, *, idcode: int | None = None) -> None:
-        """``rate`` in frames/s; ``idcode`` of the stream, that of the first PMU unless given."""
+    def __init__(
+        self, pmus: Sequence[PmuModel], rate: int, *, idcode: int | None = None, nominal_hz: float | None = None
+    ) -> None:
+        """``rate`` in frames/s; ``idcode`` of the stream, that of the first PMU unless given.
+
+        ``nominal_hz`` of the grid, 50 or 60; unless given, that at which PMUs usually report at this rate.
+        """
         self.pmus = tuple(pmus)
-        self.nominal_hz = 50.0 if rate in (25, 50, 100) else 60.0
+        self.nominal_hz = (50.0 if rate in (25, 50, 100) else 60.0) if nominal_hz is None else nominal_hz
         self.config = StreamConfig(
             self.pmus[0].idcode if idcode is None else idcode,
             tuple(station_of(pmu, nominal_hz=self.nominal_hz) for pmu in self.pmus),

@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from support.rig import BASE_V
 from support.streams import MS, START_NS, samples
 
 from dcon.core import pmu as pmus_of
@@ -18,6 +19,11 @@ from dcon.core.rows import CORE
 from dcon.core.state import Pmu
 from dcon.core.thresholds import Thresholds
 from dcon.core.values import Sample
+from dcon.frontend import bind
+from pmutools.c37118 import Frame
+from pmutools.flow import StampSource
+from pmutools.grid.emulate import EmulatedStream
+from pmutools.grid.pmu_model import Measurement, fleet
 
 PARAMS = Params.paired(("N1",), ("S1",), nominal_kv=500.0)
 BRIDGING = Params.paired(("N1",), ("S1",), nominal_kv=500.0, interpolate_single_loss=True)
@@ -78,6 +84,37 @@ def test_a_duplicate_is_ignored() -> None:
 def test_stamp_tolerance_of_10_us(off_ns: int, good: bool) -> None:
     pmu = feed([*GOOD[:10], GOOD[10]._replace(time_ns=GOOD[10].time_ns + off_ns)])
     assert flags(pmu) == ([] if good else ["stamp_step"])
+
+
+FIFTY = Params.paired(("N1",), ("S1",), nominal_kv=500.0, rate_hz=50)
+"""Frames 20 ms apart, which every TIME_BASE below has exactly."""
+
+
+def over_the_wire(shift_ns: int, time_base: int) -> list[Sample]:
+    """Eleven frames through C37.118 bytes, the last stamped ``shift_ns`` late."""
+    stream = EmulatedStream(fleet(1)[:1], 50, nominal_hz=60.0)
+    stream.config = replace(stream.config, time_base=time_base)
+    binding = bind("N1", stream.config, rate_hz=50, voltage=("V1",))
+    found = []
+    for k in range(11):
+        stamp_ns = START_NS + k * 20 * MS + (k == 10) * shift_ns
+        v1 = cmath.rect(BASE_V, 0.3)
+        data = stream.data_frame([Measurement(stamp_ns, v1, v1, v1, v1, 0j, stream.nominal_hz, 0.0)])
+        reading = binding.read(Frame(data, START_NS + k * 20 * MS + 60 * MS, StampSource.CAPTURE, 0))
+        assert reading is not None and reading.sample.time_ns == stamp_ns
+        found.append(reading.sample)
+    return found
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    ("time_base", "stands_ns", "falls_ns"),
+    [(1_000_000, 10_000, 11_000), (10_000_000, 10_000, 10_100), (100_000, 10_000, 20_000), (1_000, MS, 2 * MS)],
+)
+def test_stamp_step_at_its_tolerance(time_base: int, stands_ns: int, falls_ns: int, sign: int) -> None:
+    """10 µs, or a tick of a coarser TIME_BASE: at it good, one tick beyond it a step."""
+    assert flags(feed(over_the_wire(sign * stands_ns, time_base), FIFTY)) == []
+    assert flags(feed(over_the_wire(sign * falls_ns, time_base), FIFTY)) == ["stamp_step"]
 
 
 def test_stamps_in_whole_milliseconds_are_as_good_as_their_time_base() -> None:
@@ -196,6 +233,17 @@ def test_one_lost_frame_is_bridged_where_asked() -> None:
 
 def test_two_lost_frames_are_not_bridged() -> None:
     assert flags(feed([*GOOD[:20], GOOD[22]], BRIDGING)) == ["stamp_step"]
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_a_run_without_a_frequency_is_not_bridged(frames: int) -> None:
+    """The midpoint of two angles says nothing while the filter has not started: the run begins anew."""
+    begun = feed(GOOD[:frames], BRIDGING)
+    pmu = feed([GOOD[frames + 1]], BRIDGING, begun)
+    if frames == 3:
+        assert flags(pmu) == ["interpolated"] and len(pmu.ring) == 3
+    else:
+        assert flags(pmu) == ["stamp_step"] and pmu.filter.frames == 1 and pmu.ring == ()
 
 
 def test_the_bridge_holds_where_the_angle_wraps() -> None:

@@ -154,6 +154,26 @@ def test_how_it_ends(how: str) -> None:
     assert rig.records[-1].state == ("ACTIVE" if how == "probe_stop" else "STANDBY")
 
 
+def test_a_switch_while_probing_is_as_bumpless_as_without() -> None:
+    """N1 falls silent: the transfer starts from the feedback's command, not from what is driven with the signal."""
+    signals = {**BIASED, "N2": Signal(hz=constant(0.0))}
+    rig, quiet = (probed(signals=signals) for _ in range(2))
+    rig.tick(Order("probe_start"))
+    quiet.tick()
+    for each in (rig, quiet):
+        each.run(15)
+        each.signals = {**signals, "N1": Signal(hz=constant(0.0025), lost=lambda _: True)}
+        each.run(90)
+        active = {record.active for record in each.records}
+        assert 0 in active and 2 in active
+    switched = next(k for k, record in enumerate(rig.records) if record.active == 2)
+    assert rig.records[switched].probe_mw == pytest.approx(80.0, abs=0.1)
+    commands = [record.command_mw for record in rig.records]
+    assert commands == [record.command_mw for record in quiet.records]
+    assert commands[switched] == pytest.approx(45.0, abs=1e-3) and commands[-1] == pytest.approx(22.5, abs=1e-3)
+    assert max(abs(b - a) for a, b in pairwise(commands[switched - 1 :])) < 0.376  # 22.5 MW in 1 s
+
+
 def test_orders_that_are_refused() -> None:
     rig = Rig(steady(), extra=SQUARE).run(12)
     assert Event("refused", "probe_start", "not in STANDBY") in rig.tick(Order("probe_start")).events

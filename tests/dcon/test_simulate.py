@@ -16,34 +16,65 @@ import numpy as np
 import pytest
 
 from dcon.cli import dcon
-from dcon.core.differentiator import PAPER_60, response
+from dcon.core.differentiator import coefficients, response
 from dcon.limiter import MW_PER_V
 from dcon.session.columns import read_columns
+from dcon.session.log import SessionReader
 from dcon.session.replay import replay
 from dcon.sim.delays import split
-from dcon.sim.plan import Plan
+from dcon.sim.plan import RATES, Plan
 from dcon.sim.simulate import SCHEDULE_MW, simulate
+from pmutools.c37118 import decode_config
 from pmutools.cli.shell import run
-from pmutools.grid.modal import SEPARATED_FROM_ALBERTA
+from pmutools.grid.modal import SEPARATED_FROM_ALBERTA, SINGLE_MODE
 from pmutools.grid.theory import closed_loop_eigenvalue, frequency_and_damping
 from pmutools.impair.profile import parse_profile
 
 Capsys = pytest.CaptureFixture[str]
 KEYS = (
-    *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "seed", "duration_s", "mode", "open_loop"),
+    *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "rate_hz", "seed", "duration_s", "mode", "open_loop"),
     *("peak_command_mw", "final_state", "events"),
 )
 
 
-def differentiator(s: complex) -> complex:
+def differentiator(s: complex, rate: int = 60) -> complex:
     """The controller's, over true frequency."""
-    return response(PAPER_60, cmath.exp(s / 60)) * 2 * math.pi / s
+    return response(coefficients(rate), cmath.exp(s / rate)) * 2 * math.pi / s
 
 
 def told(capsys: Capsys, *arguments: str) -> list[dict[str, object]]:
     assert run(dcon(), ["simulate", *arguments, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     return said if isinstance(said, list) else [said]
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_every_rate_damps_as_its_own_filter_does(rate: int, capsys: Capsys) -> None:
+    """A 60 Hz grid whatever the rate; the loop's eigenvalue is worked out with the filter of that rate."""
+    (result,) = told(capsys, "cjb", "--rate", str(rate), "--gain", "12", "--duration", "13")
+    exact = closed_loop_eigenvalue(
+        SINGLE_MODE, SINGLE_MODE[0], 12, delay_s=0.082, feedback=lambda s: differentiator(s, rate)
+    )
+    hz, ratio = frequency_and_damping(exact)
+    mode = result["mode"]
+    assert isinstance(mode, dict) and result["rate_hz"] == rate
+    assert mode["frequency_hz"] == pytest.approx(hz, abs=0.002)
+    assert mode["damping_percent"] == pytest.approx(100 * ratio, abs=0.1)
+    assert result["final_state"] == "ACTIVE"
+
+
+def test_fifty_frames_a_second_of_a_60_hz_grid(tmp_path: Path, capsys: Capsys) -> None:
+    told(capsys, "cjb", "--rate", "50", "--duration", "3", "--out", str(tmp_path))
+    path = tmp_path / "session.mcap"
+    config = decode_config(SessionReader(path).configs["N1"])[1]
+    assert (config.rate, config.stations[0].fnom_hz) == (50, 60.0)
+    again = replay(path)
+    assert (again.ticks, again.different, again.stopped) == (180, 0, "")
+
+
+def test_a_rate_that_no_pmu_has(capsys: Capsys) -> None:
+    assert run(dcon(), ["simulate", "cjb", "--rate", "25"]) == 2
+    assert "--rate': 25 is not one of 30, 50, 60, 100, 120 frames/s" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("gain", "hz", "percent"), [(0, 0.425, 7.8), (9, 0.433, 10.3), (12, 0.435, 11.4)])
