@@ -27,11 +27,11 @@ class Limited(NamedTuple):
 
 
 def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
     try:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return None
         number = float(value)
-    except OverflowError:
+    except Exception:  # too large, or an object whose methods fail
         return None
     return number if math.isfinite(number) else None
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+from dcon.core.clash import Clash
 from dcon.core.params import Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
@@ -23,10 +24,14 @@ PARAMS = {item.name: item for item in fields(Params)}
 ELSEWHERE = frozenset(("pmus", "instances", "rate_hz", "thresholds", "line", "required", "probing"))
 """Fields of Params that other sections fill: no keys of ``[controller]``."""
 _RATE = PARAMS["rate_hz"].metadata
+GAIN_MAX = Params.gain_max_mw_per_mhz
+"""MW/mHz that a line may be controlled with."""
 RATE_HZ = 60
 """Of a PMU whose section names none."""
 PROBE_BYTES = 16 << 20
 """Largest file of a probing signal."""
+_SEPARATORS = " ,()"
+"""In lists of instances."""
 T = TypeVar("T")
 
 
@@ -106,12 +111,21 @@ class Settings:
 
 
 def load(path: str | Path) -> Settings:
-    """Read an initialisation file. Raises SourceError where it cannot be read, SettingsError for what is in it."""
-    return from_ini(*read_ini(path))
+    """Read an initialisation file that a line is to be controlled by: the gain is held to what is feasible.
+
+    Raises SourceError where it cannot be read, SettingsError for what is in it.
+    """
+    ini, text = read_ini(path)
+    settings = from_ini(ini, text)
+    most = settings.params.gain_max_mw_per_mhz
+    if most > GAIN_MAX:
+        where = ini.section("controller").entries["gain_max_mw_per_mhz"].where
+        raise where.error(f"{most:g} MW/mHz is above {GAIN_MAX:g}; only simulations and replays go beyond it")
+    return settings
 
 
 def parse(text: str, source: str, changes: tuple[str, ...] = (), *, probe_file: bytes | None = None) -> Settings:
-    """Settings of an INI text; ``changes`` are ``SECTION.KEY=VALUE`` laid over it.
+    """Settings of an INI text, of a simulation or a replay; ``changes`` are ``SECTION.KEY=VALUE`` laid over it.
 
     ``probe_file`` is what the file of ``[probing]`` held; it is read where that is None.
     """
@@ -127,8 +141,12 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
     watchdog, server = fill(Watchdog, ini.section("watchdog")), fill(Server, ini.section("server"))
     required = Required(platform.gps_required, watchdog.required, server.required)
     probing, probe_file = probing_of(ini.section("probing"), probe_file)
+    try:
+        params = _params(ini, sites, required, probing)
+    except Clash as clash:
+        raise _placed(clash, ini, "controller") from None
     return Settings(
-        _params(ini, sites, required, probing),
+        params,
         sites,
         fill(Output, ini.section("output")),
         platform,
@@ -147,10 +165,7 @@ def probing_of(section: Section, data: bytes | None = None) -> tuple[Probing, by
         if data is None:
             data = _read(entry)
         values["samples"] = _column(entry, data, values.get("column", "probe_mw"))
-    try:
-        return Probing(**values), data or b""
-    except SettingsError as error:
-        raise section.where.error(error) from None
+    return _made(Probing, section, values), data or b""
 
 
 def _read(entry: Entry) -> bytes:
@@ -193,13 +208,15 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
             raise entry.where.error(
                 f"{rate_of(site)} frames/s, but {sites[0].name} has {rate_of(sites[0])}; the controller needs one rate"
             )
+        if site.side != "none" and set(site.name) & set(_SEPARATORS):
+            raise section.where.error("the name of a PMU with a side has no space, comma or bracket; rename it")
     section = ini.section("controller")
     entries = dict(section.entries)
     priority = entries.pop("priority", None)
     given = _numbers(Params, Section(section.name, section.where, entries), skip=ELSEWHERE)
     thresholds = _filled(Thresholds, ini.section("supervisor"))
     line = _filled(Line, ini.section("pdci"))
-    instances = _every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
+    instances = every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
         entry = entries.get("gain_mw_per_mhz") or entries["gain_max_mw_per_mhz"]
@@ -215,17 +232,34 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
             rate_hz=rate_of(sites[0]),
             **given,
         )
+    except Clash:
+        raise
     except SettingsError as error:
         raise section.where.error(error) from None
 
 
 def _filled(cls: type[T], section: Section) -> T:
-    """A dataclass of a section; what its values are not together is said of the section."""
-    values = _numbers(cls, section)
+    """A dataclass of a section."""
+    return _made(cls, section, _numbers(cls, section))
+
+
+def _made(cls: type[T], section: Section, values: dict[str, Any]) -> T:
+    """What its values are not together is said of one of them, else of the section."""
     try:
         return cls(**values)
+    except Clash as clash:
+        raise _placed(clash, Ini(section.where.source, (section,)), section.name) from None
     except SettingsError as error:
         raise section.where.error(error) from None
+
+
+def _placed(clash: Clash, ini: Ini, section: str) -> SettingsError:
+    """A clash with the line of the first key that it is about and the file gives; ``section`` is that of bare keys."""
+    for place, name in enumerate(clash.keys):
+        kind, _, key = name.rpartition(".")
+        if (entry := ini.section(kind or section).entries.get(key)) is not None:
+            return entry.where.error(clash if place else clash.problem)
+    return ini.section(section).where.error(clash)
 
 
 def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[str, Any]:
@@ -249,7 +283,7 @@ def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[st
     return values
 
 
-def _every_pair(source: str, sites: tuple[Site, ...]) -> tuple[Pair, ...]:
+def every_pair(source: str, sites: tuple[Site, ...]) -> tuple[Pair, ...]:
     """Every north PMU with every south one, in the order of the file."""
     sides = {side: [index for index, site in enumerate(sites) if site.side == side] for side in ("north", "south")}
     for side, members in sides.items():
@@ -276,34 +310,3 @@ def _priority(sites: tuple[Site, ...], priority: Entry) -> tuple[Pair, ...]:
     if not pairs:
         raise priority.where.error("lists no pair; write NORTH-SOUTH,NORTH-SOUTH,... or leave the key out")
     return tuple(pairs)
-
-
-def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
-    """Every setting in force but those of single PMUs, for ``dcon check``: section, key, value with unit, source."""
-    rows = []
-    params = settings.params
-    sections: tuple[tuple[str, Any], ...] = (
-        ("controller", params),
-        ("supervisor", params.thresholds),
-        ("probing", params.probing),
-        ("pdci", params.line),
-        ("platform", settings.platform),
-        ("watchdog", settings.watchdog),
-        ("server", settings.server),
-        ("output", settings.output),
-        ("log", settings.log),
-    )
-    for section, values in sections:
-        left_out = {"controller": ELSEWHERE, "probing": ("samples",)}.get(section, ())
-        for item in fields(values):
-            if item.name not in left_out:
-                value = _shown(getattr(values, item.name), item.metadata.get("unit", ""))
-                rows.append((section, item.name, value, item.metadata.get("source", "")))
-        if section == "controller":
-            rows.append((section, "priority", ",".join(params.instance_names), ""))
-    return rows
-
-
-def _shown(value: object, unit: str) -> str:
-    text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
-    return f"{text.lower() if isinstance(value, bool) else text} {unit}".strip()

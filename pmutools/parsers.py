@@ -58,7 +58,7 @@ def number(low: float = -math.inf, high: float = math.inf) -> Parser[float]:
 
     def parse(text: str) -> float:
         try:
-            value = float(text)
+            value = float(_ascii(text))
         except ValueError:
             raise ValueError(f"{text!r} is not a number") from None
         return _within(value, text, low, high)
@@ -71,7 +71,7 @@ def integer(low: float = -math.inf, high: float = math.inf) -> Parser[int]:
 
     def parse(text: str) -> int:
         try:
-            value = int(text, 16 if text.strip().lower().startswith("0x") else 10)
+            value = int(_ascii(text), 16 if text.strip().lower().startswith("0x") else 10)
         except ValueError:
             raise ValueError(f"{text!r} is not a whole number") from None
         return _within(value, text, low, high)
@@ -80,6 +80,13 @@ def integer(low: float = -math.inf, high: float = math.inf) -> Parser[int]:
 
 
 N = TypeVar("N", int, float)
+
+
+def _ascii(text: str) -> str:
+    """``text``, unless it is one that Python only takes for a number: digits of other scripts, underscores."""
+    if not text.isascii() or "_" in text:
+        raise ValueError(text)
+    return text
 
 
 def _within(value: N, text: str, low: float, high: float) -> N:
@@ -102,7 +109,7 @@ def probability(text: str) -> float:
     """``5%`` or ``0.05``."""
     percent = text.strip().endswith("%")
     try:
-        value = float(text.strip().removesuffix("%")) / (100 if percent else 1)
+        value = float(_ascii(text).strip().removesuffix("%")) / (100 if percent else 1)
     except ValueError:
         raise ValueError(f"{text!r} is not a probability; write 5% or 0.05") from None
     if not 0 <= value <= 1:
@@ -127,8 +134,8 @@ def duration_ns(unit_ns: int, low: float = 0.0) -> Parser[int]:
 
     def parse(text: str) -> int:
         try:
-            value = Decimal(text.strip())
-        except InvalidOperation:
+            value = Decimal(_ascii(text).strip())
+        except (InvalidOperation, ValueError):
             raise ValueError(f"{text!r} is not a number") from None
         _within(float(value), text, low, math.inf)
         return round(value * unit_ns)
@@ -142,7 +149,7 @@ milliseconds_ns = duration_ns(NS // 1000)
 
 _SPANS_NS = {"ms": NS // 1000, "s": NS, "min": 60 * NS, "h": 3600 * NS, "d": 86400 * NS}
 _SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
-_MEASURE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
+_MEASURE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)", re.ASCII)
 
 
 def span_ns(text: str) -> int:
@@ -190,7 +197,7 @@ class Place(NamedTuple):
 def parse_place(text: str, low: float = -math.inf) -> Place:
     """``12.5`` (seconds into the recording, not below ``low``) or an ISO-8601 UTC time such as 2016-09-08T17:05:11Z."""
     try:
-        if Decimal(text.strip()).is_finite():
+        if text.isascii() and Decimal(text.strip()).is_finite():
             return Place(duration_ns(NS, low)(text), relative=True)
     except InvalidOperation:
         pass
@@ -239,8 +246,8 @@ class Indices:
         return any(index >= offset and (index - offset) % period == 0 for period, offset in self.every)
 
 
-_RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d*))?")
-_EVERY = re.compile(r"every\s+(\d+)(?:\s+offset\s+(\d+))?")
+_RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d*))?", re.ASCII)
+_EVERY = re.compile(r"every\s+(\d+)(?:\s+offset\s+(\d+))?", re.ASCII)
 
 
 def indices(text: str) -> Indices:

@@ -103,6 +103,9 @@ class Ini:
         name, dot, key = target.strip().rpartition(".")
         if not (equals and dot and name and key):
             raise SettingsError(f"{source}: {assignment!r} is not SECTION.KEY=VALUE")
+        if name == "DEFAULT":
+            where = f"{source}: [DEFAULT] {key}"
+            raise SettingsError(f"{where}: is merged into each [pmu NAME]; change it there: 'pmu NAME.{key}={text}'")
         old = self.section(name)
         entry = Entry(text.strip(), Where(source, section=name, key=key.lower()))
         new = replace(old, entries={**old.entries, key.lower(): entry})

@@ -30,7 +30,7 @@ LAYERS = [
     ["dcon.core"],
     ["dcon.supervisor", "dcon.watchdog"],
     ["dcon.settings", "dcon.frontend"],
-    ["dcon.engine"],
+    ["dcon.effective", "dcon.engine"],
     ["dcon.session"],
     ["dcon.drivers"],
     ["dcon.sim", "dcon.platform"],

@@ -16,14 +16,18 @@ from pmutools.parsers import (
     boolean,
     call,
     choice,
+    duration_ns,
     indices,
     integer,
     milliseconds_ns,
     number,
     one_of,
+    parse_place,
     parsed_by,
     probability,
     seconds_ns,
+    size_bytes,
+    span_ns,
     split_top,
     words,
 )
@@ -145,3 +149,14 @@ def test_a_list_is_the_union_of_its_items(
     expected.update(*(range(offset, 500, period) for period, offset in every))
     expected.update(() if tail is None else range(tail, 500))
     assert {index for index in range(500) if index in chosen} == {index for index in expected if index < 500}
+
+
+@pytest.mark.parametrize(
+    "parse",
+    [number(), integer(), probability, duration_ns(10**9), span_ns, size_bytes, indices, parse_place],
+    ids=lambda parse: parse.__qualname__,
+)
+@pytest.mark.parametrize("text", ["१२", "१२%", "१२s", "१२MB", "every १२", "1-२", "２０16-09-08T17:05:11Z"])
+def test_digits_are_ascii(parse: Parser[Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        parse(text)

@@ -14,25 +14,25 @@ from pmutools.cli.shell import common
 @click.option("--ini", required=True, metavar="FILE")
 @common
 def command(ini: str, as_json: bool, quiet: bool, verbose: int) -> None:
-    """Read an initialisation file as the controller would, and print what is in force, with units and sources."""
-    from dcon.settings import effective, load
+    """Read an initialisation file as the controller would, and print what is in force.
+
+    Each setting with its unit, where its value comes from, and the default where that is another.
+    """
+    from dcon.effective import effective
+    from dcon.settings import load
     from pmutools.sites import Site
 
     settings = load(ini)
-    sites = [
-        {item.name: _plain(getattr(site, item.name)) for item in fields(Site) if getattr(site, item.name) is not None}
-        for site in settings.sites
-    ]
     rows = effective(settings)
     if as_json:
-        keys = ("section", "key", "value", "source")
-        click.echo(json.dumps({"pmus": sites, "settings": [dict(zip(keys, row, strict=True)) for row in rows]}))
+        sites = [
+            {key.name: _plain(value) for key in fields(Site) if (value := getattr(site, key.name)) is not None}
+            for site in settings.sites
+        ]
+        click.echo(json.dumps({"pmus": sites, "settings": [row._asdict() for row in rows]}))
         return
-    for site in sites:
-        name = site.pop("name")
-        click.echo(f"[pmu {name}]  " + "  ".join(f"{key} = {value}" for key, value in site.items()))
-    for section, key, value, source in rows:
-        click.echo(f"[{section}] {key} = {value}" + (f"   ({source})" if source else ""))
+    for row in rows:
+        click.echo(row)
 
 
 def _plain(value: object) -> object:

@@ -41,7 +41,7 @@ def _rate(text: str) -> int:
 @click.option("--noise", type=Parsed(number(0, 100)), default=0.0, metavar="MRAD", help="Angle noise of every PMU.")
 @click.option("--fault", "faults", multiple=True, metavar="NAME", help="A fault of the paper; repeatable.")
 @click.option("--impair", metavar="PROFILE", help="An impairment profile: a ready one's name, or a file.")
-@click.option("--no-control", is_flag=True, help="Compute and log, but drive nothing.")
+@click.option("--no-control", is_flag=True, help="Do not arm: nothing is driven but a probing signal.")
 @click.option("--no-align", is_flag=True, help="Do not align on time stamps (to see why one must).")
 @click.option("--interpolate", is_flag=True, help="Bridge single lost frames by their midpoint.")
 @click.option("--duration", type=Parsed(number(1e-3, 86400)), metavar="S", help="Default: until all is seen.")

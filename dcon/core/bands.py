@@ -12,7 +12,7 @@ from typing import NamedTuple
 from dcon.core.thresholds import Thresholds
 
 HIGHEST = 0.4
-"""Edges are held below this share of the tick rate."""
+"""No edge may be above this share of the tick rate: near half of it, the transform bends a filter out of shape."""
 _Q2 = math.sqrt(0.5)
 _Q4 = (0.5411961001461969, 1.3065629648763766)
 """Quality of the section(s) of a Butterworth filter of second and of fourth order."""
@@ -29,7 +29,7 @@ class Section(NamedTuple):
 
 
 Band = tuple[Section, ...]
-"""Sections in cascade; none at all where the ticks are too slow for the band."""
+"""Sections in cascade."""
 Memory = tuple[float, ...]
 """Two numbers a section."""
 
@@ -61,14 +61,9 @@ class Bands(NamedTuple):
 
 def bands_of(limits: Thresholds, tick_hz: int) -> Bands:
     """The filters for ``limits`` at ``tick_hz``."""
-    highest = HIGHEST * tick_hz
-    ringing: Band = ()
-    if limits.ringing_low_hz < min(limits.ringing_high_hz, highest):
-        ringing = (
-            *(high_pass(limits.ringing_low_hz, tick_hz, q) for q in _Q4),
-            low_pass(min(limits.ringing_high_hz, highest), tick_hz),
-        )
-    swing = (high_pass(limits.growth_low_hz, tick_hz), low_pass(min(limits.growth_high_hz, highest), tick_hz))
+    steep = [high_pass(limits.ringing_low_hz, tick_hz, q) for q in _Q4]
+    ringing = (*steep, low_pass(limits.ringing_high_hz, tick_hz))
+    swing = (high_pass(limits.growth_low_hz, tick_hz), low_pass(limits.growth_high_hz, tick_hz))
     return Bands(ringing, swing, 1 - math.exp(-1 / (limits.ringing_rms_s * tick_hz)))
 
 

@@ -49,7 +49,7 @@ def watched(params: Params, last: Feedback, command_mw: float, asked_mw: float) 
     ticks = last.ticks + 1
     window = (1 << round(limits.saturation_s * tick_hz)) - 1
     at_limit = abs(command_mw) >= params.limit_mw > 0
-    ring_mw, ringing = passed(bands.ringing, last.ringing, asked_mw) if bands.ringing else (0.0, ())
+    ring_mw, ringing = passed(bands.ringing, last.ringing, asked_mw)
     swing_mw, swing = passed(bands.swing, last.swing, command_mw)
     half_mw, peaks = last.half_mw, last.peaks_mw
     if swing_mw * half_mw < 0:

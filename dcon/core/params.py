@@ -12,7 +12,8 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from dcon.core.bands import Bands, bands_of
+from dcon.core.bands import HIGHEST, Bands, bands_of
+from dcon.core.clash import Clash, check_order
 from dcon.core.differentiator import Coefficients, coefficients
 from dcon.core.probe import SWEPT, Probing, Waveform, waveform
 from dcon.core.thresholds import Thresholds, check_bounds, setting
@@ -53,6 +54,7 @@ class Line:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        check_order(self, [("minimum_mw", key) for key in ("rating_ns_mw", "rating_sn_mw") if getattr(self, key) > 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class Params:
     gain_mw_per_mhz: float = setting(9.0, "MW/mHz", "section VI: 9 to 15 feasible, 9 and 12 tested")
     """Gain at the start; bounded by ``gain_max_mw_per_mhz``."""
     gain_max_mw_per_mhz: float = setting(15.0, "MW/mHz", "section VI", 0, 100)
-    """Largest gain an order may set; only simulations raise it."""
+    """Largest gain an order may set; only simulations and replays take more than 15."""
     gain_ramp_per_s: float = setting(3.0, "MW/mHz/s", "choice", 0.01, 100)
     """How fast the gain moves to an ordered value."""
     deadband_mhz: float = setting(0.25, "mHz", "section VI, the 2017 test", 0, 100)
@@ -94,9 +96,9 @@ class Params:
     """Rate of the control loop."""
     nominal_hz: float = setting(60.0, "Hz", "the Western Interconnection", 50, 60)
     """Nominal frequency."""
-    align: bool = True
+    align: bool = field(default=True, metadata={"source": "section V.C"})
     """Subtract frequencies of identical stamps (section V.C); False only to show why (Figs. 13-15)."""
-    interpolate_single_loss: bool = False
+    interpolate_single_loss: bool = field(default=False, metadata={"source": "section V.B: a dropout disables"})
     """Bridge exactly one lost frame by its midpoint (section V.B, Algorithm 1) and stay READY."""
     init_s: float = setting(20.0, "s", "section IV: approximately 20 s", 0, 3600)
     """Valid data, from both PMUs, before an instance is READY after any disable."""
@@ -119,8 +121,7 @@ class Params:
             raise SettingsError(
                 f"gain_mw_per_mhz = {self.gain_mw_per_mhz:g}: must be 0 to {self.gain_max_mw_per_mhz:g} MW/mHz"
             )
-        if self.probing.kind in SWEPT and self.probing.high_hz >= self.tick_hz / 2:
-            raise SettingsError(f"high_hz = {self.probing.high_hz:g}: must be below half of {self.tick_hz} ticks/s")
+        check_together(self)
         names = [pmu.name for pmu in self.pmus]
         if len(set(names)) < len(names):
             raise SettingsError(f"two PMUs of one name: {', '.join(names)}")
@@ -186,3 +187,34 @@ class Params:
     @cached_property
     def transfer_ticks(self) -> int:
         return max(1, round(self.transfer_s * self.tick_hz))
+
+
+def check_together(params: Params) -> None:
+    """Raise Clash for settings of different sections that exclude each other."""
+    limits, line, probing, tick_hz = params.thresholds, params.line, params.probing, params.tick_hz
+    if params.nominal_hz not in (50, 60):
+        raise Clash(f"{params.nominal_hz:g}: C37.118 has 50 and 60 Hz only", "controller.nominal_hz")
+    for key in ("ringing_high_hz", "growth_high_hz"):
+        if (edge_hz := getattr(limits, key)) > HIGHEST * tick_hz:
+            most = f"at most {HIGHEST * tick_hz:g} Hz, {HIGHEST:g} of tick_hz = {tick_hz}"
+            raise Clash(f"{edge_hz:g}: {most}", f"supervisor.{key}", "controller.tick_hz")
+    fastest = {"square": "frequency_hz", **dict.fromkeys(SWEPT, "high_hz")}.get(probing.kind)
+    if fastest is not None and (hz := getattr(probing, fastest)) >= tick_hz / 2:
+        raise Clash(f"{hz:g}: must be below half of {tick_hz} ticks/s", f"probing.{fastest}", "controller.tick_hz")
+    if fastest is not None and probing.amplitude_mw > params.limit_mw:
+        problem = f"{probing.amplitude_mw:g}: above limit_mw = {params.limit_mw:g}, the signal would be clipped"
+        raise Clash(problem, "probing.amplitude_mw", "controller.limit_mw")
+    if not limits.overruns_max < tick_hz:
+        problem = f"{limits.overruns_max:g}: must be below tick_hz = {tick_hz}, the ticks of a second"
+        raise Clash(problem, "supervisor.overruns_max", "controller.tick_hz")
+    if not limits.alignment_age_ms > 1e3 / params.rate_hz:
+        problem = f"{limits.alignment_age_ms:g}: must be above the {1e3 / params.rate_hz:.1f} ms from frame to frame"
+        raise Clash(problem, "supervisor.alignment_age_ms")
+    if not params.deadband_mhz < limits.delta_f_max_mhz:
+        problem = f"{params.deadband_mhz:g}: must be below delta_f_max_mhz = {limits.delta_f_max_mhz:g}"
+        raise Clash(problem, "controller.deadband_mhz", "supervisor.delta_f_max_mhz")
+    room_mw = max(line.rating_ns_mw, line.rating_sn_mw) - line.minimum_mw
+    if room_mw < 2 * params.limit_mw:
+        problem = f"{line.minimum_mw:g}: leaves {room_mw:g} MW below the rating, but ±limit_mw needs"
+        keys = ("pdci.minimum_mw", "pdci.rating_ns_mw", "pdci.rating_sn_mw", "controller.limit_mw")
+        raise Clash(f"{problem} {2 * params.limit_mw:g}", *keys)

@@ -12,6 +12,7 @@ import random
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from dcon.core.clash import Clash, check_order
 from dcon.core.law import approach
 from dcon.core.thresholds import check_bounds, setting
 from dcon.limiter import LIMIT_MW, SLEW_MW_PER_S
@@ -69,10 +70,16 @@ class Probing:
         check_bounds(self)
         if self.kind not in KINDS:
             raise SettingsError(f"kind = {self.kind!r}: must be one of {', '.join(KINDS)}")
-        if not self.low_hz < self.high_hz:
-            raise SettingsError(f"low_hz = {self.low_hz:g}: must be below high_hz = {self.high_hz:g}")
+        check_order(self, (("low_hz", "high_hz"),))
+        if self.kind == "square" and (length_s := self.cycles / self.frequency_hz) > LONGEST_S:
+            problem = f"{self.cycles}: at frequency_hz = {self.frequency_hz:g} that is {length_s:g} s"
+            raise Clash(f"{problem}; {LONGEST_S:g} s at most", "cycles", "frequency_hz")
+        if self.kind == "multisine" and self.low_hz * self.period_s < 1:
+            raise Clash(f"{self.low_hz:g}: no whole cycle in period_s = {self.period_s:g}", "low_hz", "period_s")
+        if self.kind in SWEPT and 2 * self.ramp_s > self.duration_s:
+            raise Clash(f"{self.ramp_s:g}: more than half of duration_s = {self.duration_s:g}", "ramp_s", "duration_s")
         if self.kind == "file" and not self.samples:
-            raise SettingsError("kind = file: no samples; give file = NAME.csv")
+            raise Clash("file: no samples; give file = NAME.csv", "kind")
         if not all(abs(mw) <= LIMIT_MW for mw in self.samples):
             raise SettingsError(f"{self.file}: every value must be within ±{LIMIT_MW:g} MW")
 

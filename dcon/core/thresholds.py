@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Final
 
+from dcon.core.clash import check_order
 from pmutools.errors import SettingsError
 
 RING_SIZE = 32
@@ -30,6 +31,20 @@ def check_bounds(values: object) -> None:
         value = getattr(values, item.name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise SettingsError(f"{item.name} = {value!r}: must be {low:g} to {high:g} {item.metadata['unit']}")
+
+
+ASCENDING: Final = (
+    ("latency_min_ms", "latency_warn_ms"),
+    ("latency_warn_ms", "latency_max_ms"),
+    ("latency_warn_ms", "alignment_age_ms"),
+    ("voltage_min_pu", "voltage_max_pu"),
+    ("freq_warn_s", "freq_disable_s"),
+    ("ringing_low_hz", "ringing_high_hz"),
+    ("growth_low_hz", "growth_high_hz"),
+    ("response_gain_min", "response_gain_max"),
+)
+"""Pairs of which the first must be below the second: warnings come before what they warn of, bands have a width, and
+frames that are not even late are not too old to be aligned."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +153,4 @@ class Thresholds:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        for low, high in (
-            ("latency_min_ms", "latency_max_ms"),
-            ("voltage_min_pu", "voltage_max_pu"),
-            ("ringing_low_hz", "ringing_high_hz"),
-            ("growth_low_hz", "growth_high_hz"),
-        ):
-            if not getattr(self, low) < getattr(self, high):
-                raise SettingsError(f"{low} = {getattr(self, low):g}: must be below {high} = {getattr(self, high):g}")
+        check_order(self, ASCENDING)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,7 @@ from typing import Any, Final, NamedTuple
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import Outcome, Tell, simulate
 from pmutools.errors import SettingsError, SourceError
+from pmutools.parsers import number
 
 LIMIT: Final = 10_000
 """Runs of one sweep."""
@@ -56,12 +58,12 @@ def parse_axis(text: str) -> Axis:
     """``NAME=FROM:TO:STEP``, both ends included. Raises SettingsError."""
     name, equals, span = text.partition("=")
     try:
-        first, last, step = (float(part) for part in span.split(":"))
-        count = int((last - first) / step + 1e-9) + 1
+        first, last, step = map(number(), span.split(":"))
+        count = math.floor((last - first) / step + 1e-9) + 1
     except (ValueError, ZeroDivisionError, OverflowError):
         equals = ""
-    if not equals or name not in SWEPT or first < 0 or not 0 < count <= LIMIT:
-        raise SettingsError(f"--sweep {text}: write {'|'.join(SWEPT)}=FROM:TO:STEP, as in gain=0:15:3")
+    if not equals or name not in SWEPT or min(first, last) < 0 or not 0 < count <= LIMIT:
+        raise SettingsError(f"--sweep {text}: write {'|'.join(SWEPT)}=FROM:TO:STEP, not below 0, as in gain=0:15:3")
     values = [round(first + step * number, 12) for number in range(count)]
     if name == "seed" and any(value % 1 for value in values):
         raise SettingsError(f"--sweep {text}: seeds are whole numbers")
@@ -79,12 +81,12 @@ def runs(plan: Plan, axes: Sequence[Axis], folder: str | os.PathLike[str] | None
     if count > LIMIT:
         raise SettingsError(f"--sweep: more than {LIMIT} runs")
     found = []
-    for number, values in enumerate(itertools.product(*(axis.values for axis in axes)), 1):
+    for place, values in enumerate(itertools.product(*(axis.values for axis in axes)), 1):
         swept = {axis.name: value for axis, value in zip(axes, values, strict=True)}
         fields: dict[str, Any] = {SWEPT[name].field: value * SWEPT[name].scale for name, value in swept.items()}
         if "seed" in swept:
             fields["seed"] = int(swept["seed"])
-        name = "session.mcap" if count == 1 else f"session-{number}.mcap"
+        name = "session.mcap" if count == 1 else f"session-{place}.mcap"
         path = None if folder is None else os.path.join(folder, name)
         found.append(Run(replace(plan, **fields), swept, path))
     return found

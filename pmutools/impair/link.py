@@ -19,7 +19,7 @@ from pmutools.impair.selectors import ANY, Selector, selector_of_any
 from pmutools.parsers import integer, parsed_by
 from pmutools.timebase import NS
 
-_RATE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]?)(?:bit(?:/s)?)?")
+_RATE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]?)(?:bit(?:/s)?)?", re.ASCII)
 _FACTOR = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
 
 

@@ -29,7 +29,7 @@ class Span(NamedTuple):
 
 
 WHOLE = Span(0, 0)
-_BYTES = re.compile(r"(\d+)(?:-(\d+))?")
+_BYTES = re.compile(r"(\d+)(?:-(\d+))?", re.ASCII)
 
 
 def byte_span(text: str) -> Span:

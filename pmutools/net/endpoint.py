@@ -164,7 +164,7 @@ def _number(url: str, query: dict[str, str], key: str, low: int, high: int) -> i
     text = query.get(key)
     if text is None:
         return None
-    if not re.fullmatch(r"\d{1,6}", text) or not low <= int(text) <= high:
+    if not re.fullmatch(r"[0-9]{1,6}", text) or not low <= int(text) <= high:
         raise SettingsError(f"{url}: {key}={text} is not a whole number {low}..{high}")
     return int(text)
 
@@ -193,6 +193,6 @@ def _data(url: str, text: str | None, scheme: Scheme) -> tuple[str | None, int |
     if scheme is not Scheme.TCP_UDP:
         raise SettingsError(f"{url}: 'data' belongs to {Scheme.TCP_UDP}:// only")
     host, _, port = text.rpartition(":")
-    if not re.fullmatch(r"\d{1,5}", port) or not int(port) <= 65535:
+    if not re.fullmatch(r"[0-9]{1,5}", port) or not int(port) <= 65535:
         raise SettingsError(f"{url}: data={text} is not a port 0..65535 (or GROUP:PORT)")
     return host.strip("[]") or None, int(port)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import ast
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,31 @@ ANYTHING = st.one_of(
 def test_what_is_no_finite_number_is_zero_at_once(wanted: object) -> None:
     assert limit(wanted, 100.0, TICK) == Limited(0.0, "invalid")
     assert volts(wanted) == 0.0
+
+
+class Failing(float):
+    def __float__(self) -> float:
+        raise RuntimeError("no")
+
+
+class Lying(int):
+    def __float__(self) -> float:
+        return "1"  # type: ignore[return-value]
+
+
+class Faceless:
+    @property
+    def __class__(self) -> type:  # type: ignore[override]
+        raise KeyError("no")
+
+
+@pytest.mark.parametrize("make", [lambda: Failing(5.0), lambda: Lying(5), Faceless], ids=["float", "int", "object"])
+def test_an_object_that_fails_is_zero_wherever_it_stands(make: Callable[[], object]) -> None:
+    bad = make()
+    usual: list[object] = [10.0, 10.0, TICK, 125.0]
+    for place in range(4):
+        assert limit(*usual[:place], bad, *usual[place + 1 :]) == Limited(0.0, "invalid")
+    assert volts(bad) == 0.0
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, math.nan, math.inf, None])

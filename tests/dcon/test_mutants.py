@@ -551,8 +551,6 @@ def passed(hz: float, edge_hz: float) -> float:
     return 1 / math.sqrt(1 + (hz / edge_hz) ** 4)
 
 
-NARROW = replace(PARAMS, tick_hz=6, thresholds=Thresholds(ringing_low_hz=3))
-"""Ticks too slow for the band of ringing."""
 PEAK = 50 * passed(0.1, 0.5) * passed(0.5, 1.5)
 JUDGING = [
     *of(
@@ -613,7 +611,6 @@ JUDGING = [
         ((QUIET._replace(ticks=60, second_mw=60.0), 60.0), (61, 0, 1.0, (), 120.0, (), False)),
         ((QUIET._replace(ticks=59, means_mw=(5.0,) * 30), 0.0), (60, 0, 0.0, (), 0.0, (0.0, *(5.0,) * 29), False)),
         ((QUIET, 0.0, 50.0), (1, 0, 0.0, (), 0.0, (), True)),
-        ((QUIET, 0.0, 50.0, NARROW), (1, 0, 0.0, (), 0.0, (), False)),
         ((TURNING, 125.0), (1, 1, 1.0, (40.0, 1, 2, 3, 4, 5, 6), 125.0, (), False)),
         ((QUIET._replace(half_mw=40.0), 125.0), (1, 1, 1.0, (), 125.0, (), False)),
     ),

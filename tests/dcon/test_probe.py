@@ -55,8 +55,8 @@ def test_what_cannot_be() -> None:
         Probing("sine")
     with pytest.raises(SettingsError, match=r"x.csv: every value must be within ±125 MW"):
         Probing("file", samples=(126.0,), file="x.csv")
-    with pytest.raises(SettingsError, match="high_hz = 5: must be below half of 10 ticks/s"):
-        Params.paired(("N",), ("S",), tick_hz=10, probing=Probing("chirp"))
+    with pytest.raises(SettingsError, match="high_hz = 10: must be below half of 20 ticks/s"):
+        Params.paired(("N",), ("S",), tick_hz=20, probing=Probing("chirp", high_hz=10))
 
 
 def course(signal: Waveform, ramp_s: float = 1.0, stop: int | None = None, ticks: int = 400) -> list[float]:

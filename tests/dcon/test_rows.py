@@ -184,7 +184,7 @@ FRAME_CASES: dict[str, Case] = {
         3.01,
     ),
 }
-SLACK = {"skew": "[supervisor]\nlatency_max_ms = 300", "late": "[supervisor]\nlatency_warn_ms = 999\ngap_ms = 500"}
+SLACK = {"skew": "[supervisor]\nlatency_max_ms = 300", "late": "[supervisor]\nlatency_warn_ms = 199\ngap_ms = 500"}
 
 
 @pytest.mark.parametrize("case", FRAME_CASES)

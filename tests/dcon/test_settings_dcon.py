@@ -9,7 +9,8 @@ import pytest
 
 from dcon.cli import dcon
 from dcon.core.params import Pair, Params, Thresholds
-from dcon.settings import effective, load, parse
+from dcon.effective import effective
+from dcon.settings import load, parse
 from pmutools.cli.shell import run
 from pmutools.errors import SettingsError, SourceError
 
@@ -53,6 +54,8 @@ url = udp://192.0.2.30:4790
 [log]
 path = /var/log/dcon.mcap
 """
+
+PAIR = "[pmu N1]\nurl = udp://h:1\nside = north\n[pmu S1]\nurl = udp://h:2\nside = south\n"
 
 
 def test_what_the_file_says_is_in_force() -> None:
@@ -100,7 +103,7 @@ MISTAKES = {
     "thresholds that exclude each other": (
         "gap_ms = 60",
         "voltage_max_pu = 0.7",
-        "dcon.ini:28: [supervisor]: voltage_min_pu = 0.8: must be below voltage_max_pu = 0.7",
+        "dcon.ini:29: [supervisor] voltage_max_pu: voltage_min_pu = 0.8: must be below voltage_max_pu = 0.7",
     ),
     "an unknown signal": (
         "[watchdog]",
@@ -110,7 +113,7 @@ MISTAKES = {
     "a signal from a file that is not given": (
         "[watchdog]",
         "[watchdog]\n[probing]\nkind = file",
-        "dcon.ini:33: [probing]: kind = file: no samples; give file = NAME.csv",
+        "dcon.ini:34: [probing] kind: file: no samples; give file = NAME.csv",
     ),
     "a signal from a file that is not there": (
         "[watchdog]",
@@ -120,7 +123,7 @@ MISTAKES = {
     "frequencies of a signal the wrong way round": (
         "[watchdog]",
         "[watchdog]\n[probing]\nlow_hz = 6",
-        "dcon.ini:33: [probing]: low_hz = 6: must be below high_hz = 5",
+        "dcon.ini:34: [probing] low_hz: 6: must be below high_hz = 5",
     ),
     "a rating below nothing": ("[pdci]", "[pdci]\nrating_ns_mw = -1", "dcon.ini:37: [pdci] rating_ns_mw: -1 is out of"),
     "an unknown section": ("[log]", "[logg]", "dcon.ini:37: [logg]: unknown section; did you mean 'log'?"),
@@ -253,6 +256,167 @@ def test_a_mistake_is_one_line_that_says_where_and_what_to_do(
     assert err.count("\n") == 1
 
 
+CLASHES = {
+    "a warning after what it warns of": ("supervisor", "latency_warn_ms=300", "latency_warn_ms: 300: must be below"),
+    "the same from the other side": (
+        "supervisor",
+        "latency_max_ms=80",
+        "latency_max_ms: latency_warn_ms = 90: must be",
+    ),
+    "a warning as late": (
+        "supervisor",
+        "latency_warn_ms=200",
+        "latency_warn_ms: 200: must be below latency_max_ms = 200",
+    ),
+    "late frames too old to align": (
+        "supervisor",
+        "alignment_age_ms=80",
+        "alignment_age_ms: latency_warn_ms = 90: must",
+    ),
+    "always too early": ("supervisor", "latency_min_ms=0\nlatency_warn_ms=0", "latency_min_ms: 0: must be below"),
+    "a time to warn after that to disable": (
+        "supervisor",
+        "freq_warn_s=5",
+        "freq_warn_s: 5: must be below freq_disable_s",
+    ),
+    "no voltage is right": (
+        "supervisor",
+        "voltage_min_pu=1.3",
+        "voltage_min_pu: 1.3: must be below voltage_max_pu = 1.2",
+    ),
+    "no band of ringing": ("supervisor", "ringing_low_hz=9", "ringing_low_hz: 9: must be below ringing_high_hz = 8"),
+    "no band of swings": ("supervisor", "growth_high_hz=0.2\ngrowth_low_hz=0.3", "growth_low_hz: 0.3: must be below"),
+    "no response is right": ("supervisor", "response_gain_max=1\nresponse_gain_min=1", "response_gain_min: 1: must be"),
+    "a band above half the ticks": ("supervisor", "ringing_high_hz=40", "ringing_high_hz: 40: at most 24 Hz, 0.4 of"),
+    "a band too near it": (
+        "supervisor",
+        "ringing_high_hz=24.1",
+        "ringing_high_hz: 24.1: at most 24 Hz, 0.4 of tick_hz = 60",
+    ),
+    "ticks too slow for a band": (
+        "controller",
+        "tick_hz=10",
+        "tick_hz: ringing_high_hz = 8: at most 4 Hz, 0.4 of tick_hz",
+    ),
+    "more late ticks than there are": (
+        "controller",
+        "tick_hz=20\n[supervisor]\noverruns_max=20",
+        "overruns_max: 20: must be below tick_hz = 20",
+    ),
+    "an age below a frame period": (
+        "supervisor",
+        "alignment_age_ms=16\nlatency_warn_ms=15",
+        "alignment_age_ms: 16: must be above the 16.7 ms from frame to frame",
+    ),
+    "a deadband that nothing leaves": (
+        "controller",
+        "deadband_mhz=100\n[supervisor]\ndelta_f_max_mhz=100",
+        "deadband_mhz",
+    ),
+    "a nominal frequency between": ("controller", "nominal_hz=55", "nominal_hz: 55: C37.118 has 50 and 60 Hz only"),
+    "a minimum above the rating": ("pdci", "minimum_mw=5000", "minimum_mw: 5000: must be below rating_ns_mw = 3220"),
+    "a rating below the minimum": (
+        "pdci",
+        "rating_sn_mw=300",
+        "rating_sn_mw: minimum_mw = 310: must be below rating_sn",
+    ),
+    "no room for the command": (
+        "pdci",
+        "minimum_mw=3000",
+        "minimum_mw: 3000: leaves 220 MW below the rating, but ±limit_mw needs 250",
+    ),
+    "a line without a rating": (
+        "pdci",
+        "rating_ns_mw=0\nrating_sn_mw=0",
+        "rating_ns_mw: minimum_mw = 310: leaves -310 MW",
+    ),
+    "a signal above half the ticks": (
+        "controller",
+        "tick_hz=20\n[probing]\nkind=chirp\nhigh_hz=10",
+        "high_hz: 10: must be below half of 20 ticks/s",
+    ),
+    "a pulse above half the ticks": (
+        "controller",
+        "tick_hz=20\n[probing]\nkind=square\nfrequency_hz=10",
+        "frequency_hz: 10: must be below half of 20 ticks/s",
+    ),
+    "a signal that would be clipped": (
+        "controller",
+        "limit_mw=15\n[probing]\nkind=square",
+        "limit_mw: amplitude_mw = 20: above limit_mw = 15, the signal would be clipped",
+    ),
+    "a pulse of days": (
+        "probing",
+        "kind=square\ncycles=1000\nfrequency_hz=0.01",
+        "cycles: 1000: at frequency_hz = 0.01",
+    ),
+    "a tone without a whole cycle": (
+        "probing",
+        "kind=multisine\nperiod_s=5",
+        "period_s: low_hz = 0.1: no whole cycle in",
+    ),
+    "ramps longer than the signal": (
+        "probing",
+        "kind=chirp\nduration_s=1",
+        "duration_s: ramp_s = 1: more than half of",
+    ),
+}
+"""(section, its keys, what is said of the line of the last key but for section and place)."""
+
+
+@pytest.mark.parametrize(("section", "keys", "message"), CLASHES.values(), ids=CLASHES)
+def test_settings_that_clash_are_said_of_a_key(section: str, keys: str, message: str) -> None:
+    text = f"{PAIR}[{section}]\n{keys}\n"
+    with pytest.raises(SettingsError) as caught:
+        parse(text, "dcon.ini")
+    said = str(caught.value)
+    key = message.partition(":")[0]
+    line = next(number for number, one in enumerate(text.split("\n"), 1) if one.startswith(f"{key}="))
+    assert said.startswith(f"dcon.ini:{line}: [") and f"] {message}" in said and "\n" not in said
+
+
+def test_a_clash_over_the_file_is_said_of_what_was_changed() -> None:
+    with pytest.raises(SettingsError, match=r"^--set: \[supervisor\] latency_warn_ms: 300: must be below"):
+        parse(PAIR, "dcon.ini", ("supervisor.latency_warn_ms=300",))
+
+
+def test_a_line_that_goes_one_way_only() -> None:
+    assert parse(f"{PAIR}[pdci]\nrating_sn_mw = 0\n", "dcon.ini").params.line.rating_sn_mw == 0
+
+
+@pytest.mark.parametrize("command", ["check", "platform"])
+def test_only_simulations_and_replays_go_beyond_a_gain_of_15(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "dcon.ini"
+    text = f"{PAIR}[controller]\ngain_mw_per_mhz = 9\ngain_max_mw_per_mhz = {{}}\n"
+    path.write_text(text.format("15.5"))
+    assert run(dcon(), [command, "--ini", str(path)]) == 2
+    said = ":9: [controller] gain_max_mw_per_mhz: 15.5 MW/mHz is above 15; only simulations and replays go beyond it"
+    assert said in capsys.readouterr().err
+    path.write_text(text.format("15"))
+    load(path)
+    assert parse(text.format("100"), "log").params.gain_max_mw_per_mhz == 100
+
+
+@pytest.mark.parametrize("name", ["N,1", "N 1", "N(1"])
+def test_a_name_that_no_priority_could_list(name: str) -> None:
+    text = PAIR.replace("[pmu N1]", f"[pmu {name}]")
+    with pytest.raises(
+        SettingsError, match=r"^dcon.ini:1: \[pmu N.1\]: the name of a PMU with a side has no space, comma"
+    ):
+        parse(text, "dcon.ini")
+    recorded = f"[pmu {name}]\nurl = udp://h:3\n{PAIR}"
+    assert parse(recorded, "dcon.ini").params.instance_names == ("N1-S1",)
+
+
+def test_a_change_of_the_defaults_says_where_to_make_it() -> None:
+    with pytest.raises(
+        SettingsError, match=r"^--set: \[DEFAULT\] rate: is merged into each \[pmu NAME\]; change it there"
+    ):
+        parse(GOOD, "dcon.ini", ("DEFAULT.rate=30",))
+
+
 def test_a_file_without_pmus() -> None:
     with pytest.raises(SettingsError, match=r"^dcon.ini: no \[pmu NAME\] section; add one for each PMU$"):
         parse("[controller]\ngain_mw_per_mhz = 9\n", "dcon.ini")
@@ -317,20 +481,61 @@ def test_a_probing_signal_from_a_file(tmp_path: Path) -> None:
     assert parse(text, "log", probe_file=settings.probe_file).params == settings.params
 
 
-def test_check_prints_every_setting_with_unit_and_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_every_setting_with_unit_default_and_source(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "dcon.ini"
-    path.write_text(GOOD)
+    path.write_text(GOOD.replace("align = true", "align = true\ndeadband_mhz = 0"))
     assert run(dcon(), ["check", "--ini", str(path)]) == 0
     text = capsys.readouterr().out
-    assert "[controller] gain_mw_per_mhz = 12 MW/mHz   (section VI" in text
-    assert "[supervisor] gap_ms = 60 ms   (section IV b)" in text
-    assert "[output] url = udp://192.0.2.30:4790" in text
-    assert "[pmu S1]  url = tcp://192.0.2.21:4712  idcode = 201  station = SOUTH ONE  side = south" in text
+    for line in (
+        "[pmu S1] url = tcp://192.0.2.21:4712   (initialisation file)",
+        "[pmu S1] idcode = 201   (initialisation file; default not set)",
+        "[pmu S1] station = SOUTH ONE   (initialisation file; default not set)",
+        "[pmu S1] voltage = VA,VB,VC   (own choice)",
+        "[pmu N2] voltage = V1LPM   (initialisation file; default VA,VB,VC)",
+        "[pmu N2] rate = 60 frames/s   (section III)",
+        "[pmu X] nominal_kv = 230 kV   (initialisation file; default not set)",
+        "[controller] gain_mw_per_mhz = 12 MW/mHz   (initialisation file; default 9 MW/mHz)",
+        "[controller] deadband_mhz = 0 mHz   (initialisation file; default 0.25 mHz)",
+        "[controller] limit_mw = 125 MW   (section I)",
+        "[controller] align = true   (section V.C)",
+        "[controller] priority = N1-S1,N1-S2,N2-S1,N2-S2   (own choice)",
+        "[supervisor] gap_ms = 60 ms   (initialisation file; default 50 ms)",
+        "[platform] phase_ms = 4.5 ms   (initialisation file; default 4 ms)",
+        "[watchdog] required = false   (own choice)",
+        "[output] url = udp://192.0.2.30:4790   (initialisation file; default not set)",
+        "[log] max_mb = 1000 MB   (own choice)",
+        "[log] max_minutes = 60 min   (own choice)",
+    ):
+        assert line in text.splitlines()
     assert run(dcon(), ["check", "--ini", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [pmu["name"] for pmu in found["pmus"]] == ["N1", "N2", "S1", "S2", "X"]
-    shown = {(row["section"], row["key"]): row["value"] for row in found["settings"]}
-    assert shown["controller", "priority"] == "N1-S1,N1-S2,N2-S1,N2-S2"
+    shown = {(row["section"], row["key"]): row for row in found["settings"]}
+    assert shown["controller", "priority"]["value"] == "N1-S1,N1-S2,N2-S1,N2-S2"
+    assert (shown["controller", "deadband_mhz"]["default"], shown["log", "max_mb"]["default"]) == ("0.25 mHz", None)
     sections = "controller supervisor probing pdci platform watchdog server output log"
-    assert {section for section, _ in shown} == set(sections.split())
+    pmus = {f"pmu {name}" for name in ("N1", "N2", "S1", "S2", "X")}
+    assert {section for section, _ in shown} == {*sections.split(), *pmus}
     assert len(shown) == len(found["settings"]) == len(effective(load(path)))
+
+
+def test_every_setting_says_where_it_comes_from_and_every_number_its_unit() -> None:
+    """At their defaults, so of every section: the sources of numbers that nothing else fixes are our own choice."""
+    bare = ("growth_max", "response_gain_min", "response_gain_max", "seed")
+    for row in effective(parse(PAIR, "dcon.ini")):
+        assert row.source and row.value, row
+        if row.value.replace(".", "").lstrip("-").isdigit():
+            assert row.key in bare, row
+    (gain,) = (row for row in effective(parse(PAIR, "dcon.ini")) if row.key == "gain_mw_per_mhz")
+    (ramp,) = (row for row in effective(parse(PAIR, "dcon.ini")) if row.key == "gain_ramp_per_s")
+    assert ramp.source == "own choice"
+    assert (gain.value, gain.default) == ("9 MW/mHz", None) and gain.source.startswith("section VI")
+
+
+def test_a_priority_of_ones_own() -> None:
+    rows = effective(parse(GOOD.replace("align = true", "priority = N2-S2"), "dcon.ini"))
+    assert "[controller] priority = N2-S2   (initialisation file; default every north with every south)" in map(
+        str, rows
+    )

@@ -318,6 +318,13 @@ def test_five_modes_keep_table_2() -> None:
         (["cjb", "--sweep", "gain=0:30:0"], "write gain"),
         (["cjb", "--sweep", "gain=-3:30:3"], "write gain"),
         (["cjb", "--sweep", "gain=0:nan:3"], "write gain"),
+        (
+            ["cjb", "--sweep", "delay=0:-1:1"],
+            "--sweep delay=0:-1:1: write gain|delay|deadband|noise|seed=FROM:TO:STEP, not",
+        ),
+        (["cjb", "--sweep", "delay=5:-5:-5"], "not below 0"),
+        (["cjb", "--sweep", "delay=0:1_0:5"], "not below 0"),
+        (["cjb", "--sweep", "gain=0:२:1"], "not below 0"),
         (["cjb", "--sweep", "plant=0:30:3"], "write gain"),
         (["cjb", "--sweep", "seed=0:1:0.5"], "--sweep seed=0:1:0.5: seeds are whole numbers"),
         (["cjb", "--sweep", "gain=0:1:1", "--sweep", "gain=2:3:1"], "--sweep gain: given twice"),
