@@ -6,7 +6,7 @@ import json
 
 import click
 
-from dcon.cli.outputs import spare
+from dcon.cli.spare import spare
 from dcon.session.tables import TABLES
 from pmutools.cli.shell import Exit, Talk, common
 
@@ -29,8 +29,11 @@ def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, q
     spare(output, sessions)
     summary = export(sessions, output, table)
     if as_json:
-        click.echo(json.dumps({"rows": summary.rows, "gaps": summary.gaps, "damage": summary.damage.lines()}))
+        said = {"rows": summary.rows, "gaps": summary.gaps, "damage": summary.damage.lines()}
+        click.echo(json.dumps(said | {"newer": summary.newer.to_json()}))
     talk.say(f"{summary.rows} rows -> {output}")
+    if summary.newer:
+        talk.say(f"warning: {sessions[0]} {summary.newer}")
     for line in summary.damage.lines():
         talk.say(f"{sessions[0]}: {line}")
     return Exit.INCOMPLETE if summary.gaps or summary.damage else Exit.DONE

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dcon.cli.outputs import spare
+from dcon.cli.spare import spare
 from pmutools.cli.shell import Exit, Talk, common
 from pmutools.errors import SettingsError, SourceError
 
@@ -66,6 +66,8 @@ def command(
         click.echo(f"{result.different} of {result.ticks} ticks differ; first: {result.first}")
     else:
         click.echo(f"{result.ticks} ticks: identical")
+    if result.newer:
+        talk.say(f"warning: {sessions[0]} {result.newer}")
     for problem in result.problems:
         talk.say(problem)
     if result.stopped:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dcon.cli.outputs import keep_sessions
+from dcon.cli.spare import keep_sessions
 from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SourceError
 from pmutools.parsers import integer, number

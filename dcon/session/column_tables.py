@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from dcon.core.values import Flag, InstanceState, Mode, SystemState
 from dcon.session.codec import Watchdog
+from dcon.session.newer import Newer
 from pmutools.flow import StampSource
 from pmutools.schema.log_reader import Damage
 
@@ -137,6 +138,8 @@ class SessionColumns:
     """Ticks whose ``/dcon/instance`` is missing; their instances are UNKNOWN and NaN."""
     damage: Damage
     """Of all parts; ``cut`` alone means no loss but that of the end."""
+    newer: Newer = field(default_factory=Newer)
+    """What the log holds that this program does not know."""
 
     def flag(self, name: str) -> npt.NDArray[np.bool_]:
         """(T,) whether a flag is up at each tick. Raises KeyError for a name that the session lacks."""

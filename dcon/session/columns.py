@@ -40,6 +40,7 @@ from dcon.session.column_tables import (
     TickColumns,
 )
 from dcon.session.log import SessionReader
+from dcon.session.newer import newer_in
 from dcon.session.parts import Part, Paths, is_apart
 from pmutools.schema.columns import Columns, Texts, decode_columns
 from pmutools.schema.descriptors import message_class
@@ -266,6 +267,7 @@ class _Builder:
             gaps=self._gaps,
             incomplete_ticks=self._incomplete,
             damage=reader.damage,
+            newer=newer_in(reader),
         )
 
 

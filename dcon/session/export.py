@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dcon.session.log import SessionReader
+from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
 from dcon.session.tables import TABLES, Column, Row, Table
 from pmutools.errors import SettingsError, SourceError
@@ -33,6 +34,7 @@ class ExportSummary(NamedTuple):
     rows: int
     gaps: int
     damage: Damage
+    newer: Newer = Newer()
 
 
 def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
@@ -65,7 +67,7 @@ def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> 
             raise
         reason = os.strerror(error.errno) if error.errno else error  # pyarrow's own text is long, and names the path
         raise SourceError(f"{out}: cannot write: {reason}") from None
-    return ExportSummary(count, rows.gaps, reader.damage)
+    return ExportSummary(count, rows.gaps, reader.damage, newer_in(reader))
 
 
 class _Rows:

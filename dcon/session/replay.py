@@ -22,6 +22,7 @@ from dcon.core.values import Order, Record
 from dcon.engine import Engine, Tick
 from dcon.session import codec
 from dcon.session.log import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
+from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
 from dcon.session.rolling import LOG_SUBJECT
 from dcon.settings import parse
@@ -119,6 +120,8 @@ class Replay:
     """Configurations that could not be used, in words."""
     largest: Driven = field(default_factory=Driven)
     """Largest change of each."""
+    newer: Newer = field(default_factory=Newer)
+    """What the log holds that this program does not know."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -128,6 +131,7 @@ class Replay:
             "changes": list(self.changes),
             "stopped": self.stopped or None,
             "problems": self.problems,
+            "newer": self.newer.to_json(),
             "largest_command_change_mw": self.largest.command_mw,
             "largest_probe_change_mw": self.largest.probe_mw,
             "largest_output_change_v": self.largest.output_v,
@@ -184,6 +188,7 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
             f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
             f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"
         )
+    result.newer = newer_in(reader)
     version = reader.metadata.get("version", "")
     if result.different and not changes and version != pmutools.__version__:
         result.problems.append(f"recorded by version {version or 'unknown'}, replayed by {pmutools.__version__}")

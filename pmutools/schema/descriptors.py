@@ -5,7 +5,7 @@ No compiler and no generated code, which would tie users to one protobuf version
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 from pmutools.schema.messages import FILE_NAME, MESSAGES, PACKAGE
@@ -37,6 +37,29 @@ def file_descriptor_set() -> bytes:
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     return FileDescriptorSet(file=[_file_descriptor()]).SerializeToString(deterministic=True)
+
+
+@lru_cache(maxsize=16)
+def unknown_fields(schema: bytes) -> frozenset[str]:
+    """``Message.field`` that a log's protobuf schema has and our table lacks: a newer program's, or another's."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.message import DecodeError
+
+    if schema == file_descriptor_set():
+        return frozenset()
+    try:
+        files = FileDescriptorSet.FromString(schema).file
+    except DecodeError:
+        return frozenset()
+    return frozenset(
+        f"{message.name}.{field.name}"
+        for file in files
+        if file.package == PACKAGE
+        for message in file.message_type
+        if message.name in MESSAGES
+        for field in message.field
+        if field.number > len(MESSAGES[message.name].fields)
+    )
 
 
 @cache

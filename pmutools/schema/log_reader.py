@@ -14,7 +14,7 @@ from typing import IO, Any, NamedTuple
 
 from pmutools.errors import SourceError
 from pmutools.schema import mcap_records as raw
-from pmutools.schema.descriptors import message_class, short_name
+from pmutools.schema.descriptors import message_class, short_name, unknown_fields
 from pmutools.schema.mcap_records import MESSAGE_RECORD, DamagedRecordError, Op
 
 
@@ -97,13 +97,15 @@ class Damage:
 class LogReader:
     """One MCAP file, read from its beginning as often as wanted.
 
-    ``damage`` is that of the last :meth:`records`, complete when its iterator is exhausted. Raises SourceError for a
+    ``damage`` is that of the last :meth:`records`, complete when its iterator is exhausted. ``unknown`` are the topics
+    and ``Message.field`` met so far that our table lacks, which are passed over. Raises SourceError for a
     file that cannot be opened, is empty, or is no MCAP file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.damage = Damage()
+        self.unknown: set[str] = set()
         with self._open() as file:
             magic = file.read(len(raw.MAGIC))
         if not magic:
@@ -131,21 +133,31 @@ class LogReader:
         def walk() -> Iterator[LogBatch]:
             with self._open() as file:
                 size = file.seek(0, os.SEEK_END)
-                yield from _Walk(file, size, damage, messages).batches()
+                yield from _Walk(file, size, damage, messages, self.unknown).batches()
 
         return walk()
 
     def decode(self, message: LogMessage) -> Any | None:
         """The protobuf message; None for one that is not ours, or (counted) does not decode."""
         from google.protobuf.message import DecodeError
+        from google.protobuf.unknown_fields import UnknownFieldSet
 
-        if message.channel.message is None:
+        name = message.channel.message
+        if name is None:
             return None
         try:
-            return message_class(message.channel.message).FromString(message.data)
+            decoded = message_class(name).FromString(message.data)
         except DecodeError:
             self.damage.undecodable += 1
             return None
+        if len(unknown := UnknownFieldSet(decoded)):
+            self._unnamed(name, {unknown[place].field_number for place in range(len(unknown))})
+        return decoded
+
+    def _unnamed(self, name: str, numbers: Collection[int]) -> None:
+        """Fields that no schema told of: only their numbers are known."""
+        if not any(known.startswith(f"{name}.") for known in self.unknown):
+            self.unknown.update(f"{name}.{number}" for number in numbers)
 
     def _open(self) -> IO[bytes]:
         try:
@@ -157,11 +169,14 @@ class LogReader:
 class _Walk:
     """One pass over a file: known schemas and channels, and the damage met."""
 
-    def __init__(self, file: IO[bytes], size: int, damage: Damage, wanted: Collection[str] | None) -> None:
+    def __init__(
+        self, file: IO[bytes], size: int, damage: Damage, wanted: Collection[str] | None, unknown: set[str]
+    ) -> None:
         self.file = file
         self.size = size
         self.damage = damage
         self.wanted = wanted
+        self.unknown = unknown
         self.schemas: dict[int, str] = {0: ""}
         self.channels: dict[int, LogChannel] = {}
         self.chunked = False
@@ -271,10 +286,14 @@ class _Walk:
             self.schemas[schema.id] = (
                 schema.name if schema.encoding == "protobuf" else f"{schema.encoding}:{schema.name}"
             )
+            if schema.encoding == "protobuf":
+                self.unknown |= unknown_fields(schema.data)
         elif opcode == Op.CHANNEL:
             channel = raw.parse(Channel, body)
             name = self.schemas.get(channel.schema_id, "")
             message = short_name(name) if channel.message_encoding == "protobuf" else None
+            if message is None:
+                self.unknown.add(channel.topic)
             self.channels[channel.id] = LogChannel(channel.topic, name, message, channel.metadata)
         elif opcode == Op.STATISTICS:
             self.announced = raw.parse(Statistics, body).message_count

@@ -73,6 +73,7 @@ def test_a_simulated_session_replays_bit_for_bit(session: Path, capsys: Capsys) 
         "changes": [],
         "stopped": None,
         "problems": [],
+        "newer": None,
         "largest_command_change_mw": 0.0,
         "largest_probe_change_mw": 0.0,
         "largest_output_change_v": 0.0,
