@@ -117,7 +117,7 @@ class Thresholds:
     ringing_low_hz: float = setting(1.5, "Hz", "choice: above every inter-area mode", 0.1, 20)
     """Lower edge of the band of ringing."""
     ringing_high_hz: float = setting(8.0, "Hz", "choice: the line may ring near 5 Hz", 0.2, 60)
-    """Upper edge."""
+    """Upper edge; at most 0.4 of the ticks' rate."""
     growth_max: float = setting(1.5, "", "choice", 1, 100)
     """Growth of the swing of the feedback command over three cycles, each growing by its share: disarm above."""
     growth_min_mw: float = setting(30.0, "MW", "choice", 0, 125)
@@ -125,7 +125,7 @@ class Thresholds:
     growth_low_hz: float = setting(0.1, "Hz", "choice", 0.01, 1)
     """Lower edge of the band of swings."""
     growth_high_hz: float = setting(1.5, "Hz", "choice", 0.2, 10)
-    """Upper edge."""
+    """Upper edge; at most 0.4 of the ticks' rate."""
     bias_max_mw: float = setting(25.0, "MW", "choice", 0, 125)
     """Mean of the feedback command: warn above."""
     bias_s: float = setting(30.0, "s", "choice", 1, 600)

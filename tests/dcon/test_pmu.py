@@ -13,6 +13,7 @@ from support.rig import BASE_V
 from support.streams import MS, START_NS, samples
 
 from dcon.core import pmu as pmus_of
+from dcon.core.checks import Supervisor
 from dcon.core.params import Params
 from dcon.core.quick import next_frame
 from dcon.core.rows import CORE
@@ -29,19 +30,23 @@ PARAMS = Params.paired(("N1",), ("S1",), nominal_kv=500.0)
 BRIDGING = Params.paired(("N1",), ("S1",), nominal_kv=500.0, interpolate_single_loss=True)
 
 
-def update(params: Params, pmu: Pmu, frames: Sequence[Sample], now_ns: int) -> Pmu:
-    return pmus_of.update(params, CORE, CORE.tables(params), params.pmus[0], pmu, frames, now_ns)
+SLOW = replace(CORE, known=((), (), ()))
+"""The same checks without the short way."""
+
+
+def update(params: Params, pmu: Pmu, frames: Sequence[Sample], now_ns: int, by: Supervisor = CORE) -> Pmu:
+    return pmus_of.update(params, by, by.tables(params), params.pmus[0], pmu, frames, now_ns)
 
 
 GOOD = list(samples(lambda t: 0.01 * math.sin(2.5 * t), 40))
 PERIOD_NS = 1e9 / 60
 
 
-def feed(frames: Iterable[Sample], params: Params = PARAMS, start: Pmu | None = None) -> Pmu:
+def feed(frames: Iterable[Sample], params: Params = PARAMS, start: Pmu | None = None, by: Supervisor = CORE) -> Pmu:
     """One frame a tick."""
     pmu = Pmu() if start is None else start
     for frame in frames:
-        pmu = update(params, pmu, (frame,), frame.arrival_ns + 5 * MS)
+        pmu = update(params, pmu, (frame,), frame.arrival_ns + 5 * MS, by)
     return pmu
 
 
@@ -113,8 +118,9 @@ def over_the_wire(shift_ns: int, time_base: int) -> list[Sample]:
 )
 def test_stamp_step_at_its_tolerance(time_base: int, stands_ns: int, falls_ns: int, sign: int) -> None:
     """10 µs, or a tick of a coarser TIME_BASE: at it good, one tick beyond it a step."""
-    assert flags(feed(over_the_wire(sign * stands_ns, time_base), FIFTY)) == []
-    assert flags(feed(over_the_wire(sign * falls_ns, time_base), FIFTY)) == ["stamp_step"]
+    for by in (CORE, SLOW):
+        assert flags(feed(over_the_wire(sign * stands_ns, time_base), FIFTY, by=by)) == []
+        assert flags(feed(over_the_wire(sign * falls_ns, time_base), FIFTY, by=by)) == ["stamp_step"]
 
 
 def test_stamps_in_whole_milliseconds_are_as_good_as_their_time_base() -> None:
@@ -268,7 +274,6 @@ def test_an_unseen_lost_frame_would_have_been_a_spike() -> None:
     assert max(spikes) == pytest.approx(0.112 * 0.02, rel=0.01)
 
 
-SLOW = replace(CORE, known=((), (), ()))
 KEYS = {
     "latency_high": "latency_warn_ms",
     "voltage": "voltage_max_pu",

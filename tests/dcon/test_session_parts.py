@@ -247,7 +247,12 @@ def test_replay_and_export_take_a_session_in_parts(session: list[Path], tmp_path
         assert run(dcon(), ["replay", *map(str, named)]) == 0
         assert capsys.readouterr().out == "420 ticks: identical\n"
         assert run(dcon(), ["export", *map(str, named), str(tmp_path / "t.csv"), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"rows": 420, "gaps": 0, "damage": []}
+        assert json.loads(capsys.readouterr().out) == {
+            "rows": 420,
+            "gaps": 0,
+            "damage": [],
+            "newer": None,
+        }
     export(tmp_path / "whole.mcap", tmp_path / "whole.csv")
     assert [line.split(",")[:7] for line in (tmp_path / "t.csv").read_text().splitlines()] == [
         line.split(",")[:7] for line in (tmp_path / "whole.csv").read_text().splitlines()
