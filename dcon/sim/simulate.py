@@ -22,6 +22,7 @@ from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
 from dcon.sim.operator import EagerOperator
 from dcon.sim.plan import NOMINAL_HZ, START_NS, Plan, ini_of
+from dcon.sim.wire import Wire
 from pmutools import timebase
 from pmutools.c37118 import Frame
 from pmutools.errors import SettingsError
@@ -93,6 +94,7 @@ class _Sender:
     def __init__(self, pmu: PmuModel, plan: Plan, profile: Profile) -> None:
         self.pmu = pmu
         self.stream = EmulatedStream([pmu], plan.rate_hz, nominal_hz=NOMINAL_HZ)
+        self.wire = Wire(pmu.name, self.stream.config)
         names = (str(pmu.idcode), pmu.bus)
         self.pipeline = Pipeline(profile, pmu.name, plan.seed, config=self.stream.config, aliases=names)
 
