@@ -13,7 +13,7 @@ import numpy as np
 
 import pmutools
 from dcon.analysis import course, numbers
-from dcon.analysis.disturbances import Floats, noise_of
+from dcon.analysis.disturbances import Floats, disturbances
 from dcon.analysis.ringdowns import Comparison, Loop, Ringdown, compare, ringdowns
 from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
@@ -214,7 +214,8 @@ def analyze(paths: Sequence[str | os.PathLike[str]]) -> Analysis:
     rate_hz = float(params.tick_hz) if params is not None else _rate_of(session)
     limit_mw = params.limit_mw if params is not None else LIMIT_MW
     gaps = course.gaps(session, rate_hz)
-    found = ringdowns(loop_of(session, rate_hz, limit_mw), session.gaps)
+    loop = loop_of(session, rate_hz, limit_mw)
+    found = ringdowns(loop, session.gaps)
     notes += [f"{Path(name).name}: {line}" for line in session.damage.lines()]
     if session.incomplete_ticks:
         notes.append(f"{session.incomplete_ticks} ticks say nothing of their instances")
@@ -235,7 +236,7 @@ def analyze(paths: Sequence[str | os.PathLike[str]]) -> Analysis:
         gaps=gaps,
         switches=course.switches(session),
         instances=course.instances(session),
-        noise_mhz=noise_of(session.tick.delta_f_mhz, rate_hz).sigma_mhz,
+        noise_mhz=disturbances(loop.delta_f_mhz, rate_hz).noise_mhz,
         ringdowns=found,
         comparison=compare(found),
         budget=numbers.delay_budget(session),

@@ -1,4 +1,8 @@
-"""Where the grid was disturbed: a change of Δf far above the session's own noise, and sudden."""
+"""Where the grid was disturbed: a change of Δf far above the noise, and sudden.
+
+A swing is no noise. One that does not die out fills the session from its begin to its end, so noise is not only looked
+for in what is quiet of the whole session, but also in what came just before each change.
+"""
 
 from __future__ import annotations
 
@@ -22,43 +26,67 @@ BEFORE_S: Final = 3.0
 KNOWN_S: Final = 1.0
 """Of it Δf must be known this long: what is there when data come back did not begin then."""
 BLOCK_S: Final = 6.0
-"""The noise is that of the blocks of this length, of which a quarter is quieter."""
+"""The session's noise is that of the blocks of this length, of which a quarter is quieter ..."""
+QUIET_S: Final = 60.0
+"""... or, if less, that of so much before a change ..."""
+QUIET_KNOWN_S: Final = 3.0
+"""... as far as so much of it is known."""
 REST_S: Final = 6.0
 """After one disturbance, none is looked for during this time."""
 
 
-class Noise(NamedTuple):
-    """How much Δf changes within :data:`LAG_S` when nothing happens."""
+class Found(NamedTuple):
+    """Rows at which a disturbance shows first, and how much Δf changes within :data:`LAG_S` when nothing happens."""
 
-    sigma_mhz: float
-    limit_mhz: float
-    """What a disturbance must exceed."""
+    rows: list[int]
+    noise_mhz: float
 
 
-def noise_of(delta_f_mhz: Floats, rate_hz: float) -> Noise:
+def disturbances(delta_f_mhz: Floats, rate_hz: float) -> Found:
     """Of a session's Δf (T,), NaN where unknown."""
     change = _changes(delta_f_mhz, rate_hz)
-    size = round(BLOCK_S * rate_hz)
-    blocks = [block[np.isfinite(block)] for block in np.split(change, range(size, len(change), size))]
-    medians = [float(np.median(block)) for block in blocks if 2 * block.size > size]
-    sigma = 1.4826 * float(np.quantile(medians, 0.25, method="lower")) if medians else 0.0
-    return Noise(sigma, max(FACTOR * sigma, LEAST_MHZ))
-
-
-def disturbances(delta_f_mhz: Floats, rate_hz: float) -> list[int]:
-    """Rows of Δf (T,) at which a disturbance shows first."""
-    change = _changes(delta_f_mhz, rate_hz)
-    limit = noise_of(delta_f_mhz, rate_hz).limit_mhz
-    before, lag, rest, least = (round(s * rate_hz) for s in (BEFORE_S, LAG_S, REST_S, KNOWN_S))
-    found: list[int] = []
-    for row in np.flatnonzero(change > limit).tolist():
-        if found and row < found[-1] + rest:
+    rest, quiet, least = (round(s * rate_hz) for s in (REST_S, QUIET_S, QUIET_KNOWN_S))
+    lag = round(LAG_S * rate_hz)
+    session = noise = _quiet_blocks(change, round(BLOCK_S * rate_hz))
+    rows: list[int] = []
+    for row in np.flatnonzero((change > LEAST_MHZ) & _sudden(change, rate_hz)).tolist():
+        if rows and row < rows[-1] + rest:
             continue
-        past = change[max(0, row - lag - before) : max(0, row - lag)]
+        past = change[max(0, row - lag - quiet) : max(0, row - lag)]
         past = past[np.isfinite(past)]
-        if past.size >= least and np.nanmax(change[row : row + lag]) > SUDDEN * past.max():
-            found.append(row)
-    return found
+        before = min(session, _deviation(past)) if past.size >= least else session
+        if change[row] > FACTOR * before:
+            rows.append(row)
+            noise = min(noise, before)
+    return Found(rows, noise)
+
+
+def _quiet_blocks(change: Floats, size: int) -> float:
+    blocks = [block[np.isfinite(block)] for block in np.split(change, range(size, len(change), size))]
+    found = [_deviation(block) for block in blocks if 2 * block.size > size]
+    return float(np.quantile(found, 0.25, method="lower")) if found else 0.0
+
+
+def _deviation(change: Floats) -> float:
+    """Robust standard deviation of what ``change`` (N,) are the magnitudes of."""
+    return 1.4826 * float(np.median(change))
+
+
+def _sudden(change: Floats, rate_hz: float) -> npt.NDArray[np.bool_]:
+    """(T,) whether the largest change of the next :data:`LAG_S` is far above that of :data:`BEFORE_S` before."""
+    before, lag, least = (round(s * rate_hz) for s in (BEFORE_S, LAG_S, KNOWN_S))
+    window = np.lib.stride_tricks.sliding_window_view
+    known = np.where(np.isfinite(change), change, -np.inf)
+    past = np.concatenate((np.full(before + lag, -np.inf), known))[: len(change) + before]
+    ahead = np.concatenate((known, np.full(lag, -np.inf)))
+    if not len(change):
+        return np.zeros(0, np.bool_)
+    counts = np.cumsum(np.concatenate(([0], np.isfinite(past))))
+    enough = (counts[before:] - counts[:-before])[: len(change)] >= least
+    return np.asarray(
+        enough
+        & (window(ahead, lag).max(axis=1)[: len(change)] > SUDDEN * window(past, before).max(axis=1)[: len(change)])
+    )
 
 
 def _changes(delta_f_mhz: Floats, rate_hz: float) -> Floats:

@@ -84,7 +84,7 @@ def comparison_figure(rows: Sequence[Comparison]) -> Figure:
     gain = np.array([row.gain_mw_per_mhz if row.closed else 0.0 for row in rows])
     damping = np.array([row.damping_percent for row in rows])
     words = [
-        f"{'closed' if row.closed else 'open'} loop, {row.gain_mw_per_mhz:g} MW/mHz: {row.damping_percent:.2f} %, "
+        f"{'closed' if row.closed else 'open'} loop, {row.gain_mw_per_mhz:g} MW/mHz: {row.damping_percent:z.2f} %, "
         f"{row.frequency_hz:.4f} Hz"
         for row in rows
     ]
@@ -307,7 +307,7 @@ def _ringdown(session: Analysis, found: Ringdown, name: str, number: int) -> Fig
 def mode_words(mode: Mode) -> str:
     f, z = mode.frequency_hz, mode.damping_percent
     return (
-        f"{f.median:.4f} Hz ({f.low:.4f} to {f.high:.4f}), damping {z.median:.2f} % ({z.low:.2f} to {z.high:.2f}), "
+        f"{f.median:.4f} Hz ({f.low:.4f} to {f.high:.4f}), damping {z.median:z.2f} % ({z.low:z.2f} to {z.high:z.2f}), "
         f"R² {mode.r2:.3f}"
     )
 

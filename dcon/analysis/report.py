@@ -141,7 +141,7 @@ def main_findings(outcome: Outcome) -> list[str]:
         loop = f"With {row.gain_mw_per_mhz:g} MW/mHz" if row.closed else "In open loop"
         gained = "" if row.gained_percent is None else f", {row.gained_percent:+.2f} points against the open loop"
         found.append(
-            f"{loop}: {row.frequency_hz:.4f} Hz, damping {row.damping_percent:.2f} %{gained} "
+            f"{loop}: {row.frequency_hz:.4f} Hz, damping {row.damping_percent:z.2f} %{gained} "
             f"({plural(row.ringdowns, 'ringdown')})."
         )
     if not found:

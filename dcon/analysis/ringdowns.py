@@ -18,6 +18,8 @@ from pmutools.modal.matrix_pencil import ringdown
 
 ORDERS: Final = tuple(range(8, 21, 2))
 WINDOWS_S: Final = (8.0, 10.0, 12.0, 14.0)
+SHORT_S: Final = 6.0
+"""Where there is not enough for any of these, one window of so much: two periods of a slow inter-area swing."""
 SETTLE_S: Final = 2.0
 """From the first sign of a disturbance to a swing that is free: a brake of 0.5 s, and the filter."""
 AFTER_S: Final = 0.5
@@ -110,7 +112,7 @@ def _starts(loop: Loop) -> list[int]:
     """Rows at which something begins to move the grid: disturbances, and probing signals, however small."""
     probing = np.diff((loop.probe_mw != 0).astype(np.int8), prepend=0) > 0
     found: list[int] = []
-    for row in sorted((*disturbances(loop.delta_f_mhz, loop.rate_hz), *np.flatnonzero(probing).tolist())):
+    for row in sorted((*disturbances(loop.delta_f_mhz, loop.rate_hz).rows, *np.flatnonzero(probing).tolist())):
         if not found or row >= found[-1] + round(REST_S * loop.rate_hz):
             found.append(row)
     return found
@@ -131,7 +133,7 @@ def _ringdown(loop: Loop, start: int, end: int, breaks: Sequence[int]) -> Ringdo
     )
     begin = min(begin, total - 1)
     end = max(begin, min(end, begin + _same(loop, begin, end)))
-    closed = bool((loop.output_v[begin:end] != 0).any())
+    gain = _gain(loop, slice(begin, end) if end > begin else slice(start, max(search, start + 1)))
     found, why = _fit(loop, begin, end)
     if probing.any() and loop.probe_mw[begin] != 0:
         why = f"a probing signal was still on {SEARCH_S:g} s later"
@@ -140,12 +142,19 @@ def _ringdown(loop: Loop, start: int, end: int, breaks: Sequence[int]) -> Ringdo
         begin_ns=int(loop.tick_ns[begin]),
         length_s=(end - begin) / rate,
         peak_mhz=_peak(loop.delta_f_mhz[start : max(end, start + 1)]),
-        closed=closed,
-        gain_mw_per_mhz=float(loop.gain_mw_per_mhz[begin]) if closed else 0.0,
+        closed=gain != 0,
+        gain_mw_per_mhz=gain,
         saturated_s=float(saturated.sum()) / rate,
         mode=found,
         why=why,
     )
+
+
+def _gain(loop: Loop, part: slice) -> float:
+    """What closed the loop during ``part``; 0 for nothing. A probing signal drives the output of an open loop, too."""
+    driven = (loop.output_v[part] != 0) & ((loop.probe_mw[part] == 0) | (loop.situation[part] != 0))
+    at = np.flatnonzero(driven)
+    return float(loop.gain_mw_per_mhz[part][at[0]]) if at.size else 0.0
 
 
 def _after(rows: npt.NDArray[np.bool_], margin: float) -> int:
@@ -174,9 +183,9 @@ def _peak(delta_f_mhz: Floats) -> float:
 
 def _fit(loop: Loop, begin: int, end: int) -> tuple[Mode | None, str]:
     length_s = (end - begin) / loop.rate_hz
-    windows = [window for window in WINDOWS_S if window <= length_s + 1 / loop.rate_hz]
-    if not windows:
-        return None, f"only {length_s:.1f} s are free and under one control; {WINDOWS_S[0]:g} s are needed"
+    windows = [window for window in WINDOWS_S if window <= length_s + 1 / loop.rate_hz] or [SHORT_S]
+    if length_s < SHORT_S:
+        return None, f"only {length_s:.1f} s are free and under one control; {SHORT_S:g} s are needed"
     signal = loop.delta_f_mhz[begin:end]
     found = []
     for window in windows:

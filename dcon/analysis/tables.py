@@ -37,8 +37,8 @@ def comparison_table(rows: Sequence[Comparison], name: str) -> Table:
                 (f"{row.gain_mw_per_mhz:g}" if row.closed else NONE, row.gain_mw_per_mhz),
                 str(row.ringdowns),
                 f"{row.frequency_hz:.4f}",
-                f"{row.damping_percent:.2f}",
-                f"{row.damping_low_percent:.2f} to {row.damping_high_percent:.2f}",
+                f"{row.damping_percent:z.2f}",
+                f"{row.damping_low_percent:z.2f} to {row.damping_high_percent:z.2f}",
                 NONE if row.gained_percent is None else f"{row.gained_percent:+.2f}",
             )
             for row in rows
@@ -72,7 +72,7 @@ def ringdown_table(session: Analysis, stem: str) -> Table:
                     else (
                         f"{mode.frequency_hz.median:.4f}",
                         _range(mode.frequency_hz, 4),
-                        f"{mode.damping_percent.median:.2f}",
+                        f"{mode.damping_percent.median:z.2f}",
                         _range(mode.damping_percent, 2),
                         f"{mode.r2:.4f}",
                         f"{mode.fits} of {mode.tried}",

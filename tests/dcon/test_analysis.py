@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from dcon.analysis.analysis import analyze, analyze_all
 from dcon.analysis.figures import thinned
+from dcon.analysis.report import main_findings
 from dcon.cli import dcon
 from dcon.session.log import SessionReader
 from dcon.session.rolling import RollingWriter
@@ -60,6 +61,27 @@ def test_the_damping_of_table_2(folder: Path, gain: float, frequency_hz: float, 
     assert found.mode.frequency_hz.median == pytest.approx(frequency_hz, abs=0.0005)
     assert found.mode.damping_percent.median == pytest.approx(damping, abs=0.02)
     assert found.mode.fits == found.mode.tried
+
+
+def test_the_mode_that_has_lost_its_damping(folder: Path) -> None:
+    """Fig. 20: 0 % without control, 4.1 % with it, of sessions of full length."""
+    paths = [folder / "bc-open.mcap", folder / "bc-closed.mcap"]
+    for path, control in zip(paths, (False, True), strict=True):
+        simulate(Plan("bc-us-separation", gain_mw_per_mhz=12, control=control), str(path))
+    outcome = analyze_all(paths)
+    opened, closed = outcome.comparison
+    assert not opened.closed and opened.frequency_hz == pytest.approx(0.37, abs=0.0005)
+    assert opened.damping_percent == pytest.approx(0, abs=0.005)
+    assert closed.gain_mw_per_mhz == 12 and closed.gained_percent == pytest.approx(4.08, abs=0.02)
+    assert main_findings(outcome)[0].startswith("In open loop: 0.3700 Hz, damping 0.00 %")
+    assert outcome.sessions[0].noise_mhz < 0.01
+
+
+def test_a_session_that_is_probed_to_its_end_was_closed_all_the_same(folder: Path) -> None:
+    path = folder / "probing.mcap"
+    simulate(Plan("probing", duration_s=12), str(path))
+    (found,) = analyze([path]).ringdowns
+    assert (found.closed, found.gain_mw_per_mhz, found.mode) == (True, 9.0, None)
 
 
 def test_a_square_pulse_is_fitted_after_it(folder: Path) -> None:

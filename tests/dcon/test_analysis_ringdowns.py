@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dcon.analysis.disturbances import disturbances, noise_of
+from dcon.analysis.disturbances import disturbances
 from dcon.analysis.ringdowns import AFTER_S, FORCED_S, SETTLE_S, Loop, compare, ringdowns
 
 RATE = 60.0
@@ -80,15 +80,39 @@ def test_more_noise_is_more_spread() -> None:
 def test_noise_alone_is_no_disturbance(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=6000)
     slow = np.convolve(noise, np.ones(60) / 8, mode="same")
-    assert disturbances(5 * noise, RATE) == disturbances(5 * slow, RATE) == []
-    assert noise_of(5 * noise, RATE).sigma_mhz == pytest.approx(5 * math.sqrt(2), rel=0.1)
+    assert disturbances(5 * noise, RATE).rows == disturbances(5 * slow, RATE).rows == []
+    assert disturbances(5 * noise, RATE).noise_mhz == pytest.approx(5 * math.sqrt(2), rel=0.1)
+
+
+@pytest.mark.parametrize("noise_mhz", [0.0, 0.3])
+@pytest.mark.parametrize("seconds_", [15.0, 20.0, 60.0, 300.0])
+@pytest.mark.parametrize("percent", [-1.0, 0.0, 0.5, 5.0, 12.0])
+def test_a_swing_is_no_noise_however_long_it_lasts(percent: float, seconds_: float, noise_mhz: float) -> None:
+    """Also where it fills the session from its begin to its end."""
+    swing = Swing(5, 0.37, percent / 100, 12.0, noise_mhz, seconds_).signal(3)
+    (found,) = ringdowns(loop(swing))
+    assert found.mode is not None
+    assert found.mode.frequency_hz.median == pytest.approx(0.37, abs=0.002)
+    assert found.mode.damping_percent.median == pytest.approx(percent, abs=0.6 if noise_mhz else 0.01)
+    assert disturbances(swing, RATE).noise_mhz == pytest.approx(noise_mhz * math.sqrt(2), rel=0.15, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_swing_that_random_load_keeps_up_has_no_begin(seed: int) -> None:
+    """Narrow-band noise: the grid's own mode, lightly damped, driven by white noise."""
+    random = np.random.default_rng(seed).normal(size=600 * 60)
+    t = np.arange(60 * 60) / RATE
+    w = 2 * math.pi * 0.4
+    answer = np.exp(-0.04 * w * t) * np.sin(w * t)
+    swing = np.fft.irfft(np.fft.rfft(random) * np.fft.rfft(answer, len(random)))
+    assert disturbances(3 * swing / swing.std(), RATE).rows == []
 
 
 def test_a_swing_that_is_there_when_data_come_back_did_not_begin_then() -> None:
     delta = Swing(at_s=1.0, damping=0.001).signal()
-    assert len(disturbances(delta, RATE)) == 0  # too early to know
+    assert disturbances(delta, RATE).rows == []  # too early to know
     delta[: 12 * 60] = np.nan
-    assert disturbances(delta, RATE) == []
+    assert disturbances(delta, RATE).rows == []
 
 
 def test_a_second_disturbance_ends_the_first_swing() -> None:
@@ -122,6 +146,23 @@ def test_the_fit_begins_after_the_probing_signal() -> None:
     probe[round(10 * RATE) :] = 20.0
     (forced,) = ringdowns(loop(delta, probe_mw=probe))
     assert forced.mode is None and forced.why
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_loop_that_is_probed_to_the_end_is_as_it_was(closed: bool) -> None:
+    delta = Swing(10).signal()
+    probe = np.where(np.arange(len(delta)) >= 10 * RATE, 20.0, 0.0)
+    (found,) = ringdowns(
+        loop(
+            delta,
+            probe_mw=probe,
+            output_v=(probe + (9 * delta if closed else 0)) / 12.5,
+            gain_mw_per_mhz=np.full_like(delta, 9.0),
+            situation=np.full(len(delta), int(closed)),
+        )
+    )
+    assert found.mode is None and found.length_s == 0
+    assert (found.closed, found.gain_mw_per_mhz) == ((True, 9.0) if closed else (False, 0.0))
 
 
 @pytest.mark.parametrize("what", ["gain_mw_per_mhz", "situation"])
