@@ -63,7 +63,7 @@ class Damage:
     lost_bytes: int = 0
     """Bytes passed over to find the next chunk, and those of a last, incomplete record."""
     orphans: int = 0
-    """Messages on a channel that was never announced."""
+    """Messages on a channel that is announced nowhere in the file."""
     undecodable: int = 0
     """Messages that are not what their schema says."""
     missing: int = 0
@@ -176,9 +176,12 @@ class _Walk:
         self.size = size
         self.damage = damage
         self.wanted = wanted
-        self.unknown = unknown
+        self.at = len(raw.MAGIC)
+        """Where the next record begins."""
         self.schemas: dict[int, str] = {0: ""}
         self.channels: dict[int, LogChannel] = {}
+        self.all_known = False
+        """Whether every channel that the rest of the file announces is in ``channels``."""
         self.chunked = False
         self.found = 0
         self.announced = 0
@@ -189,14 +192,32 @@ class _Walk:
         try:
             # the summary repeats every channel: with it, a damaged first chunk takes no other with it
             self._walk(summary or b"", [])
+            self.all_known = bool(self.channels)
         except DamagedRecordError:
             self.damage.records += 1
         yield from self._data_section()
         if summary is not None:
             self.damage.missing = max(0, self.announced - self.found - self.damage.orphans)
 
+    def _announced_later(self, number: int) -> LogChannel | None:
+        """The channel of a message whose announcement is lost: writers of logs without end repeat them now and then.
+
+        A channel known from then on is not looked for again, nor any once the rest of the file has been searched.
+        """
+        if self.all_known:
+            return None
+        ahead = _Walk(self.file, self.size, Damage(), ())
+        ahead.at, ahead.schemas, ahead.channels, ahead.all_known = self.at, dict(self.schemas), dict(self.channels), True
+        for _ in ahead._data_section():
+            if number in ahead.channels:
+                break
+        else:
+            self.all_known = True
+        self.channels.update(ahead.channels)
+        return self.channels.get(number)
+
     def _data_section(self) -> Iterator[LogBatch]:
-        at = floor = len(raw.MAGIC)  # floor: nothing before it is looked at again
+        at = floor = self.at  # floor: nothing before it is looked at again
         while at < self.size:
             record = raw.read_record(self.file, at, self.size)
             if record is None:
@@ -210,6 +231,7 @@ class _Walk:
                     continue
             if record.opcode == Op.DATA_END:
                 return
+            self.at = record.end
             try:
                 yield from self._top_level(record)
             except DamagedRecordError:
@@ -263,7 +285,7 @@ class _Walk:
                 stop = at + head + length
                 if stop > end or length < message_head - head:
                     raise DamagedRecordError("record length")
-                channel = channels.get(number)
+                channel = channels.get(number) or self._announced_later(number)
                 if channel is None:
                     self.damage.orphans += 1
                 else:

@@ -20,6 +20,10 @@ CHUNK_NS = NS
 CHUNK_BYTES = 4 << 20
 """... and at most this many bytes before compression, which bounds the memory of writer and reader."""
 
+DEFINED_EVERY = 10
+"""The second chunk and every chunk of this number repeat all schemas and channels (about 1.5 kB), as MCAP allows: what
+is left of a log without its end can be read, whichever chunk is lost."""
+
 
 class LogWriter:
     """Writes one MCAP file (zstd chunks with CRC, embedded schemas, index at the end); a context manager.
@@ -116,6 +120,8 @@ class LogWriter:
             return
         chunk, self._chunk = self._chunk, OpenChunk()
         record, index = self._summary.chunk(self.size, chunk)
+        if self._summary.chunks == 1 or self._summary.chunks % DEFINED_EVERY == 0:
+            self._chunk.define(self._summary.definitions())
         with self._writing():
             self._put(record + index)  # both or neither: what is counted as lost is not in the file
 

@@ -67,7 +67,7 @@ class Summary:
         self._schemas: dict[str, int] = {}
         self._counts: dict[int, int] = {}
         self._times = [1 << 64, 0]
-        self._messages = self._chunks = self._attachments = self._metadata = 0
+        self._messages = self.chunks = self._attachments = self._metadata = 0
         self._groups: dict[Op, list[bytes]] = {}
 
     @cached_property
@@ -92,6 +92,10 @@ class Summary:
         number = len(self._groups.get(Op.CHANNEL, ())) + 1
         record = serialised(Channel(number, topic, "protobuf", dict(metadata), schema))
         return number, self._note(Op.CHANNEL, record)
+
+    def definitions(self) -> bytes:
+        """All schemas and channels so far, to be repeated."""
+        return b"".join((*self._groups.get(Op.SCHEMA, ()), *self._groups.get(Op.CHANNEL, ())))
 
     def chunk(self, at: int, chunk: OpenChunk) -> tuple[bytes, bytes]:
         """Records of a chunk that begins at offset ``at``, and of its message indexes, which follow it."""
@@ -120,7 +124,7 @@ class Summary:
             )
         )
         self._note(Op.CHUNK_INDEX, RECORD_HEAD.pack(Op.CHUNK_INDEX, len(index)) + index)
-        self._chunks += 1
+        self.chunks += 1
         self._messages += chunk.messages
         self._times = [min(self._times[0], chunk.start_ns), max(self._times[1], chunk.stop_ns)]
         return record, b"".join(indexes)
@@ -151,7 +155,7 @@ class Summary:
             attachment_count=self._attachments,
             channel_count=len(self._groups.get(Op.CHANNEL, ())),
             channel_message_counts=self._counts,
-            chunk_count=self._chunks,
+            chunk_count=self.chunks,
             message_count=self._messages,
             message_end_time=self._times[1],
             message_start_time=self._times[0] if self._messages else 0,

@@ -170,6 +170,31 @@ def test_rot_loses_whole_ticks_and_marks_the_first_after_them(tmp_path: Path) ->
     assert reader.damage.records == 1 and not reader.damage.cut
 
 
+def test_a_flipped_bit_in_a_log_of_a_killed_process_loses_the_chunk_it_hits_and_no_more(tmp_path: Path) -> None:
+    from mcap.records import ChunkIndex
+    from mcap.stream_reader import StreamReader
+
+    ticks = random_ticks(60 * 13)
+    path = write_session(tmp_path / "s.mcap", ticks)
+    data = path.read_bytes()
+    index = [record for record in StreamReader(io.BytesIO(data)).records if isinstance(record, ChunkIndex)]
+    spans = [(record.chunk_start_offset, record.chunk_start_offset + record.chunk_length) for record in index]
+    starts = [range(record.message_start_time, record.message_end_time + 1) for record in index]
+    killed = data[: spans[-1][1]]
+    chosen = random.Random(4)
+    early = [chosen.randrange(*spans[0]), chosen.randrange(*spans[1])]
+    for at in (*early, *(chosen.randrange(8, len(killed)) for _ in range(98))):
+        rotten = bytearray(killed)
+        rotten[at] ^= 1 << chosen.randrange(8)
+        path.write_bytes(rotten)
+        reader = SessionReader(path)
+        seen = {message.tick_ns for message in reader.groups({"Tick"}) if message.one("Tick") is not None}
+        hit = [span for (start, end), span in zip(spans, starts, strict=True) if start <= at < end]
+        missing = {tick.record.tick_ns for tick in ticks} - seen
+        assert all(any(tick_ns in span for span in hit) for tick_ns in missing), at
+        assert not reader.damage.orphans and bool(hit) <= bool(reader.damage.losses)
+
+
 def test_a_damaged_head_does_not_hide_the_session(tmp_path: Path) -> None:
     ticks = random_ticks(120)
     path = write_session(tmp_path / "s.mcap", ticks)

@@ -175,7 +175,7 @@ def test_any_damage_is_survived(
 
 
 def test_a_lost_first_chunk_takes_no_other_with_it(tmp_path: Path, whole: bytes) -> None:
-    """Channels are announced in the first chunk; the summary repeats them."""
+    """Channels are announced in the first chunk; the second, every tenth, and the summary repeat them."""
     (_, end, times), *_ = chunk_spans(whole)
     records, reader = read(tmp_path / "a.mcap", whole[: end - 9] + bytes(9) + whole[end:])
     assert ticks_of(records) == [T0 + k * NS // 3 for k in range(len(times), 15)]
@@ -183,7 +183,54 @@ def test_a_lost_first_chunk_takes_no_other_with_it(tmp_path: Path, whole: bytes)
 
     *_, (_, last_end, _) = chunk_spans(whole)
     records, reader = read(tmp_path / "b.mcap", whole[: end - 9] + bytes(9) + whole[end:last_end])
-    assert ticks_of(records) == [] and reader.damage.orphans == 15 - len(times) and reader.damage.cut
+    assert ticks_of(records) == [T0 + k * NS // 3 for k in range(len(times), 15)]
+    assert reader.damage.records == 1 and not reader.damage.orphans and reader.damage.cut
+
+
+def long_log(path: Path) -> tuple[bytes, bytes]:
+    """Forty chunks of two channels: whole, and as it was when its writer might have been killed."""
+    log = LogWriter(path)
+    channels = [log.channel("/dcon/event", "Event"), log.channel("/dcon/setting", "Setting")]
+    for k in range(80):
+        now_ns = T0 + k * NS // 2
+        log.checkpoint(now_ns)
+        log.write(channels[k % 2], event(now_ns, "x" * 400), now_ns, now_ns)
+    log.flush()
+    killed = path.read_bytes()
+    log.close()
+    return path.read_bytes(), killed
+
+
+def test_announcements_are_repeated_and_any_reader_takes_them(tmp_path: Path) -> None:
+    from mcap.records import Channel, Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    data, killed = long_log(tmp_path / "a.mcap")
+    chunks = [each for each in StreamReader(io.BytesIO(data), emit_chunks=True).records if isinstance(each, Chunk)]
+    announcing = [
+        number
+        for number, chunk in enumerate(chunks)
+        if [each.topic for each in breakup_chunk(chunk) if isinstance(each, Channel)]
+    ]
+    assert announcing == [0, 1, 10, 20, 30]
+    records, reader = read(tmp_path / "a.mcap", killed)
+    assert len(ticks_of(records)) == 80 and not reader.damage.losses
+
+
+def test_what_lies_before_the_first_announcement_left_is_read_too(tmp_path: Path) -> None:
+    data, killed = long_log(tmp_path / "a.mcap")
+    spans = chunk_spans(data)
+    for lost, kept in (({0, 1}, 76), (set(range(10)), 60), ({0, 1, 10, 20}, 72)):
+        rotten = bytearray(killed)
+        for number in lost:
+            rotten[spans[number][1] - 9] ^= 1
+        records, reader = read(tmp_path / "b.mcap", bytes(rotten))
+        assert len(ticks_of(records)) == kept
+        assert reader.damage.records == len(lost) and not reader.damage.orphans
+    for number in (0, 1, 10, 20, 30):
+        rotten[spans[number][1] - 9] ^= number not in {0, 1, 10, 20}
+    records, reader = read(tmp_path / "c.mcap", bytes(rotten))
+    assert ticks_of(records) == [] and reader.damage.orphans == 70
     assert any("unknown channel" in line for line in reader.damage.lines())
 
 
