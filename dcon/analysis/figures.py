@@ -38,6 +38,10 @@ MOST_FLAGS: Final = 16
 MOST_RINGDOWNS: Final = 8
 """With a figure of their own."""
 MOST_STRETCHES: Final = 3000
+SHADES: Final = 400
+"""Cells of a row of the timeline, some three pixels each: what is shorter is drawn as a shade of its cell."""
+TINTS: Final = ((0.02, 0.35), (0.1, 0.5), (0.4, 0.65), (math.inf, 0.8))
+"""Up to this share of a cell: how much of the colour."""
 CELLS: Final = 900
 BEFORE_S, AFTER_S = 3.0, 4.0
 """Shown around a fit."""
@@ -114,17 +118,15 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
     names = ["state", "mode", "active instance"]
     marks: list[Mark] = []
     marks += _gap_marks(session)
-    by_state = _by_name(session.states)
-    marks += [
-        _bar(f"{name}", found, 0, STATE_COLORS.get(name, theme.MUTED), listed=True) for name, found in by_state.items()
-    ]
+    for name, found in _by_name(session.states).items():
+        marks += bars(name, found, 0, STATE_COLORS.get(name, theme.MUTED), shown_ms, listed=True)
     for name, found in _by_name(session.modes).items():
-        marks.append(_bar(name, found, 1, theme.GREEN if name == "closed_loop" else theme.MUTED, listed=False))
+        marks += bars(name, found, 1, theme.GREEN if name == "closed_loop" else theme.MUTED, shown_ms)
     by_instance = {name: found for name, found in _by_name(session.actives).items() if name}
     for place, (name, found) in enumerate(by_instance.items()):
-        marks.append(_bar(name, found, 2, theme.CYCLE[place % len(theme.CYCLE)], listed=False))
+        marks += bars(name, found, 2, theme.CYCLE[place % len(theme.CYCLE)], shown_ms)
     for name, found in sorted(session.flags.items(), key=lambda item: item[1][0].begin_ns)[:MOST_FLAGS]:
-        marks.append(_bar(name, found, len(names), theme.VERMILION, listed=False))
+        marks += bars(name, found, len(names), theme.VERMILION, shown_ms)
         names.append(name)
     if orders := session.columns.orders[:MOST_STRETCHES]:
         marks.append(
@@ -147,10 +149,34 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
         [Panel(Axis("", names=names), marks)],
         "Point at a bar for its name and times. Flags are drawn in the order in which they first rose"
         + (f", the first {MOST_FLAGS}." if len(session.flags) > MOST_FLAGS else ".")
+        + f" Stretches too short to be seen are pale bars of {(shown_ms[1] - shown_ms[0]) / SHADES / 1e3:.2g} s each, "
+        "the darker the more of it they fill; zoom in to see them one by one."
         + (" Shaded: ticks that are not in the log." if session.gaps else ""),
         110 + 26 * len(names),
         wide=True,
     )
+
+
+def bars(
+    name: str, found: Sequence[Stretch], row: int, color: str, shown_ms: tuple[float, float], *, listed: bool = False
+) -> list[Line]:
+    """Stretches as thick broken lines: below, what is too short to be seen, as shades; above, every stretch itself."""
+    begin_ms, cell_ms = shown_ms[0], (shown_ms[1] - shown_ms[0]) / SHADES
+    short = [each for each in found if (each.end_ns - each.begin_ns) / 1e6 < cell_ms]
+    cells: dict[int, list[float]] = {}
+    for each in short:
+        middle_ms = (each.begin_ns + each.end_ns) / 2e6
+        cells.setdefault(math.floor((middle_ms - begin_ms) / cell_ms), []).append((each.end_ns - each.begin_ns) / 1e6)
+    shades: dict[float, list[Stretch]] = {}
+    for cell, times_ms in sorted(cells.items()):
+        tint = next(tint for most, tint in TINTS if sum(times_ms) <= most * cell_ms)
+        from_ns, to_ns = (round((begin_ms + number * cell_ms) * 1e6) for number in (cell, cell + 1))
+        words = f"{name}: {len(times_ms)} times, {sum(times_ms) / 1e3:.3f} s in all"
+        shades.setdefault(tint, []).append(Stretch(words, from_ns, to_ns))
+    drawn = [_bar(name, each, row, theme.tint(color, tint), listed=False) for tint, each in sorted(shades.items())]
+    lost = set(short) if len(found) > MOST_STRETCHES else set()
+    exact = [each for each in found if each not in lost]
+    return [*drawn, _bar(name, exact[:MOST_STRETCHES], row, color, listed=listed)] if exact else drawn
 
 
 def _bar(name: str, found: Sequence[Stretch], row: int, color: str, *, listed: bool) -> Line:
@@ -166,7 +192,7 @@ def _bar(name: str, found: Sequence[Stretch], row: int, color: str, *, listed: b
 
 def _by_name(found: Iterable[Stretch]) -> dict[str, list[Stretch]]:
     names: dict[str, list[Stretch]] = {}
-    for each in list(found)[:MOST_STRETCHES]:
+    for each in found:
         names.setdefault(each.name, []).append(each)
     return names
 
@@ -230,7 +256,7 @@ def _signals(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fig
         Panel(Axis("Δf (mHz)"), [*marks, _line(session, "Δf", delta_f_of(session.columns), theme.BLUE)], 1.3),
         Panel(Axis("power (MW)"), command, 1.3),
         Panel(Axis("f (Hz)"), [*marks, *frequencies], 1.2),
-        Panel(Axis("gain (MW/mHz)"), [_line(session, "gain", tick.gain_mw_per_mhz, theme.GREEN)], 0.6),
+        Panel(Axis("K (MW/mHz)"), [_line(session, "gain K", tick.gain_mw_per_mhz, theme.GREEN)], 0.8),
     ]
     thin = (
         f" Of every {len(tick.tick_ns) * 2 // MOST_POINTS + 1} ticks or so the least and the largest value are drawn."

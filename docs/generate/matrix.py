@@ -35,6 +35,13 @@ CASES = {
     "cjb-12": _case("brake, 12 MW/mHz", duration_s=20.0),
     "cjb-15": _case("brake, 15 MW/mHz: saturates for a moment", gain_mw_per_mhz=15.0),
     "bc-us-separation": _case("a mode without damping", scenario="bc-us-separation", duration_s=25.0),
+    "bc-alberta-separation": _case(
+        "British Columbia and Alberta part", scenario="bc-alberta-separation", duration_s=20.0
+    ),
+    "south-generation-loss": _case(
+        "generation is lost in the south", scenario="south-generation-loss", duration_s=20.0
+    ),
+    "probing": _case("multisine of ±20 MW, 0.1 to 5 Hz", scenario="probing", duration_s=25.0),
     "square-pulse": _case("±125 MW at the mode's frequency", scenario="square-pulse", duration_s=20.0),
     "ambient": _case("random load, 0.3 mrad of noise", scenario="ambient", noise_rad=3e-4, duration_s=20.0),
     "ambient-noisy": _case(

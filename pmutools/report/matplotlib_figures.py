@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from functools import singledispatch
+from functools import cache, singledispatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +56,7 @@ _STYLE: dict[Any, Any] = {
     "ytick.labelcolor": theme.INK,
     "text.color": theme.INK,
     "text.parse_math": False,  # a name may hold dollar signs
+    "lines.solid_capstyle": "butt",  # a stretch of time ends where it ends
     "svg.fonttype": "none",
     "svg.hashsalt": "pmutools",  # the same run, the same bytes
     "timezone": "UTC",
@@ -63,6 +64,13 @@ _STYLE: dict[Any, Any] = {
 _ROW_IN, _LETTER_IN = 0.19, 0.073
 """Rough sizes of 9 pt text: a row of the legend, a letter."""
 _MOST_NAMES = 44
+_MOST_TICKS = 7
+_STEPS_S = (
+    *(0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600),
+    *(3600 * hours for hours in (2, 3, 6, 12)),
+    *(86_400 * days for days in (1, 2, 7, 14, 30, 90, 365)),
+)
+"""Seconds between the ticks of a time axis."""
 
 
 def save(figure: Figure, folder: Path) -> list[Path]:
@@ -102,7 +110,7 @@ def _draw(figure: Figure, sheet: Any, size: tuple[float, float]) -> None:
     handles: dict[str, Any] = {}
     unit = _MS_PER_DAY if figure.x.scale is Scale.TIME else 1
     for axes, panel in zip(rows, figure.panels, strict=True):
-        _scale(axes, figure.x, panel.y)
+        _scale(axes, figure.x, panel.y, size[1] * axes.get_position().height)
         for mark in panel.marks:
             draw(mark, axes, unit)
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -149,7 +157,8 @@ def _legend(sheet: Any, handles: dict[str, Any], size: tuple[float, float]) -> i
 def _titles(figure: Figure, rows: Any, left_in: float, wide_in: float, height_in: float) -> None:
     """Titles of axes at places that are given, since to find them costs as much as to draw."""
     for axes, panel in zip(rows, figure.panels, strict=True):
-        axes.set_ylabel(clean(panel.y.title))
+        room = axes.get_position().height * height_in / max(1e-9, len(panel.y.title) * _LETTER_IN)
+        axes.set_ylabel(clean(panel.y.title), size=9 * min(1.0, room))
         axes.yaxis.set_label_coords(-(left_in - 0.26) / wide_in, 0.5)
         axes.set_title("", y=1.0)
     lowest = rows[-1]
@@ -157,8 +166,26 @@ def _titles(figure: Figure, rows: Any, left_in: float, wide_in: float, height_in
     lowest.xaxis.set_label_coords(0.5, -0.3 / (lowest.get_position().height * height_in))
 
 
-def _scale(axes: Axes, x: Axis, y: Axis) -> None:
-    from matplotlib import dates
+@cache
+def _time_locator() -> Any:
+    """Ticks of an axis in days, at round times; matplotlib's own gives up, aloud, between 3 and 5 minutes."""
+    from matplotlib.ticker import Locator
+
+    class TimeLocator(Locator):
+        def __call__(self) -> Any:
+            assert self.axis is not None
+            return self.tick_values(*self.axis.get_view_interval())
+
+        def tick_values(self, vmin: float, vmax: float) -> Any:
+            begin_s, end_s = 86_400 * vmin, 86_400 * vmax
+            step = next((step for step in _STEPS_S if end_s - begin_s <= _MOST_TICKS * step), None)
+            step = step or 365 * 86_400 * math.ceil((end_s - begin_s) / (_MOST_TICKS * 365 * 86_400))
+            return np.arange(math.ceil(begin_s / step), math.floor(end_s / step) + 1) * (step / 86_400)
+
+    return TimeLocator
+
+
+def _scale(axes: Axes, x: Axis, y: Axis, height_in: float) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     for axis, placed, told in (("x", axes.xaxis, x), ("y", axes.yaxis, y)):
@@ -169,15 +196,15 @@ def _scale(axes: Axes, x: Axis, y: Axis) -> None:
             placed.set_minor_locator(NullLocator())
             placed.set_major_formatter(FuncFormatter(lambda value, _: _power(value)))
         elif told.scale is Scale.TIME:
-            locator: Any = dates.AutoDateLocator(minticks=4, maxticks=7)  # type: ignore[no-untyped-call]
-            placed.set_major_locator(locator)
+            placed.set_major_locator(_time_locator()())
             placed.set_major_formatter(FuncFormatter(lambda value, _, axes=axes: _clock(value, axes.get_xlim())))
         elif told.names:
             every = math.ceil(len(told.names) / _MOST_NAMES)
             placed.set_ticks(range(0, len(told.names), every), [clean(name) for name in told.names[::every]])
             placed.set_tick_params(length=0)
         else:
-            placed.set_major_locator(MaxNLocator(6 if axis == "x" else 5, steps=[1, 2, 2.5, 5, 10]))
+            most = 6 if axis == "x" else max(2, min(5, round(4 * height_in)))
+            placed.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
             placed.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.7g}".replace("-", "−")))
     axes.grid(True, axis="x" if y.names else "both")
 

@@ -16,3 +16,9 @@ STEPS = ("#eef2f0", "#fee391", "#fec44f", "#fe9929", "#d95f0e", "#993404", "#3b1
 SANS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 WIDE_PX, HALF_PX = 1100, 540
 """Width of a figure that fills the page, and of one of two side by side."""
+
+
+def tint(color: str, share: float) -> str:
+    """``color`` (#rrggbb) mixed with the paper: 0 is paper, 1 the colour."""
+    mixed = (round(255 + share * (int(color[at : at + 2], 16) - 255)) for at in (1, 3, 5))
+    return "#" + "".join(f"{part:02x}" for part in mixed)

@@ -207,7 +207,12 @@ class _Walk:
         if self.all_known:
             return None
         ahead = _Walk(self.file, self.size, Damage(), ())
-        ahead.at, ahead.schemas, ahead.channels, ahead.all_known = self.at, dict(self.schemas), dict(self.channels), True
+        ahead.at, ahead.schemas, ahead.channels, ahead.all_known = (
+            self.at,
+            dict(self.schemas),
+            dict(self.channels),
+            True,
+        )
         for _ in ahead._data_section():
             if number in ahead.channels:
                 break

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dcon.analysis.analysis import analyze, analyze_all
-from dcon.analysis.figures import thinned
+from dcon.analysis.course import Stretch
+from dcon.analysis.figures import SHADES, bars, thinned
 from dcon.analysis.report import main_findings
 from dcon.cli import dcon
 from dcon.session.log import SessionReader
@@ -21,6 +22,7 @@ from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import START_NS, Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run
+from pmutools.report import theme
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -218,3 +220,21 @@ def test_thinning_keeps_the_extremes(values: list[float], most: int) -> None:
     assert np.array_equal(y[at.astype(np.int64)], thin, equal_nan=True)
     if np.isfinite(y).any():
         assert np.nanmax(thin) == np.nanmax(y) and np.nanmin(thin) == np.nanmin(y)
+
+
+def test_what_is_too_short_to_be_seen_is_a_shade() -> None:
+    """An hour in which a flag is up for one tick in each second, and once for a minute."""
+    shown_ms = (START_NS / 1e6, START_NS / 1e6 + 3.6e6)
+    ticks = [Stretch("flag", START_NS + k * 10**9, START_NS + k * 10**9 + 10**9 // 60) for k in range(3540)]
+    minute = Stretch("flag", START_NS + 3540 * 10**9, START_NS + 3600 * 10**9)
+    cell_ms = 3.6e6 / SHADES
+    shade, exact = bars("flag", [*ticks, minute], 3, theme.VERMILION, shown_ms)
+    assert exact.color == theme.VERMILION and exact.x[:2].tolist() == [minute.begin_ns / 1e6, minute.end_ns / 1e6]
+    begins, ends = shade.x[::3], shade.x[1::3]
+    assert shade.color == theme.tint(theme.VERMILION, 0.35)
+    assert len(begins) == pytest.approx(SHADES * 59 / 60, abs=1)
+    assert np.allclose(ends - begins, cell_ms, atol=1e-3)
+    assert shade.hover[0].startswith("flag: 9 times, 0.150 s in all")
+    lone, itself = bars("flag", ticks[:1], 3, theme.VERMILION, shown_ms)
+    assert lone.x[1] - lone.x[0] == pytest.approx(cell_ms) and len(itself.x) == 3
+    assert [line.color for line in bars("flag", [minute], 3, theme.VERMILION, shown_ms)] == [theme.VERMILION]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from functools import cache
@@ -37,6 +38,7 @@ from pmutools.report.figures import (
     Scale,
     Spans,
     outline,
+    time_axis,
 )
 from pmutools.report.quality_figure import CLASSES
 from pmutools.timebase import NS
@@ -237,3 +239,35 @@ def test_times_and_logs_reach_the_page_as_they_are() -> None:
     spec = plotly_figures.spec(drawn)
     assert spec["data"][0]["x"] == [1_700_000_000_000, 1_700_000_000_001]
     assert spec["layout"]["yaxis"]["range"] == pytest.approx([-3, 0]) and spec["layout"]["xaxis"]["type"] == "date"
+
+
+@pytest.mark.parametrize("span_s", [0.05, 1, 8, 61, 207, 3600, 5000, 86_400 * 3, 86_400 * 4000])
+def test_ticks_of_time_are_few_round_and_silent(span_s: float, tmp_path: Path) -> None:
+    """Between 3 and 5 minutes matplotlib's own locator gives up, aloud."""
+    begin_ms = START_NS / 1e6
+    ticks = matplotlib_figures._time_locator()().tick_values(begin_ms / 864e5, (begin_ms / 1e3 + span_s) / 86_400)
+    assert 1 <= len(ticks) <= 8
+    x = begin_ms + np.array([0.0, 1e3 * span_s])
+    line = Line("a", x, np.zeros(2), theme.BLUE)
+    figure = Figure("t", "t", "t", time_axis("time", (x[0], x[1])), [Panel(Axis("f (Hz)"), [line])])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        matplotlib_figures.save(figure, tmp_path)
+
+
+def test_the_title_of_a_low_panel_fits_it() -> None:
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Sheet
+
+    line = Line("a", np.arange(2.0), np.array([59.995, 60.005]), theme.BLUE)
+    panels = [Panel(Axis("frequency (Hz)"), [line]), Panel(Axis("gain (MW/mHz)"), [line], 0.5)]
+    with mpl.rc_context(matplotlib_figures._STYLE):
+        sheet = Sheet(figsize=(11, 4))
+        canvas = FigureCanvasAgg(sheet)
+        matplotlib_figures._draw(Figure("t", "t", "t", Axis("x", range=(0.0, 1.0)), panels), sheet, (11, 4))
+        canvas.draw()
+        upper, lower = sheet.axes
+        title = lower.yaxis.label.get_window_extent()
+        above = [upper.yaxis.label, *(label for label in upper.get_yticklabels() if label.get_text())]
+        assert not any(title.overlaps(label.get_window_extent()) for label in above)
