@@ -274,4 +274,4 @@ def test_the_title_of_a_low_panel_fits_it() -> None:
             upper.yaxis.label,
             *(label for label in upper.get_yticklabels() if low <= label.get_position()[1] <= high),
         ]
-        assert not any(title.overlaps(label.get_window_extent()) for label in [upper.yaxis.label, *shown])
+        assert not any(title.overlaps(label.get_window_extent()) for label in above)
