@@ -1,4 +1,7 @@
-"""mkdocs hook: a marker ``<!-- generated: NAME -->`` becomes what the code's own tables say (see ``generate``)."""
+"""mkdocs hook: a marker ``<!-- generated: NAME -->`` becomes what the code's own tables say (see ``generate``).
+
+Diagrams become SVG, so that the pages need no network.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import re
 from typing import Any
 
 from generate import GENERATORS
+from generate.drawing import drawn
 
 MARKER = re.compile(r"^<!-- generated: ([a-z0-9-]+) -->$", re.MULTILINE)
 
@@ -17,4 +21,4 @@ def filled(markdown: str) -> str:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by mkdocs for every page."""
-    return filled(markdown)
+    return drawn(filled(markdown))

@@ -10,7 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bench import capture, characterizing, codec, control, measuring, pacing, reading, receiving, startup, table
+from bench import (
+    analyzing,
+    capture,
+    characterizing,
+    codec,
+    control,
+    measuring,
+    pacing,
+    reading,
+    receiving,
+    startup,
+    table,
+)
 from bench.layouts import BLOCK, LAYOUTS, A, B, C, Layout
 from bench.stopwatch import Rate
 from bench.table import Budget, Row
@@ -45,7 +57,7 @@ def test_columns_are_what_tshark_prints(layout: Layout, tmp_path: Path, requires
 @pytest.mark.peer
 def test_every_group_gives_its_rows() -> None:
     rows = [*codec.rows(codec.QUICK), *startup.rows(startup.QUICK), *control.rows(control.QUICK)]
-    rows += [*measuring.rows(measuring.QUICK), *reading.rows(reading.QUICK)]
+    rows += [*analyzing.rows(analyzing.QUICK), *measuring.rows(measuring.QUICK), *reading.rows(reading.QUICK)]
     rows += [*characterizing.rows(characterizing.QUICK)]
     if shutil.which("tshark"):
         rows += capture.rows(capture.QUICK)

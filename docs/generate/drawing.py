@@ -1,0 +1,175 @@
+"""A diagram, laid out, as SVG that stands in the page itself and takes the page's colours and letters."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from html import escape
+
+from generate.diagram import Diagram, Edge, parse
+from generate.layout import LETTER, LINE, Item, Layout, Way
+
+_FENCE = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_EDGE = 10.0
+"""Around all."""
+_SMALL = 0.86
+"""Size of texts of edges, against those of nodes."""
+Point = tuple[float, float]
+
+
+def drawn(markdown: str) -> str:
+    """``markdown`` with every diagram as SVG."""
+    return _FENCE.sub(lambda found: f'<div class="diagram">{svg(parse(found[1]))}</div>', markdown)
+
+
+def laid_out(diagram: Diagram) -> Layout:
+    """The layout of a diagram; a group that edges lead to has an item ``<NAME`` before it, ``>NAME`` behind it."""
+    layout = Layout()
+
+    def item(name: str, lines: list[str] | tuple[str, ...], across: float, along: float, scale: float = 1.0) -> Item:
+        wide = max(map(len, lines)) * LETTER * scale + across
+        high = len(lines) * LINE * scale + along
+        return Item(name, high, wide) if diagram.across else Item(name, wide, high)
+
+    ends = {edge.target for edge in diagram.edges} & set(diagram.groups)
+    begins = {edge.source for edge in diagram.edges} & set(diagram.groups)
+    for name, node in diagram.nodes.items():
+        made = Item(name, 14, 14) if node.kind == "start" else item(name, node.lines, 26, 16)
+        made.group = node.group
+        layout.nodes[name] = made
+    for group in diagram.groups:
+        members = [name for name, node in diagram.nodes.items() if node.group == group]
+        if group in ends:
+            layout.nodes["<" + group] = Item("<" + group, group=group)
+            layout.unseen += [("<" + group, name) for name in members]
+        if group in begins:
+            layout.nodes[">" + group] = Item(">" + group, group=group)
+            layout.unseen += [(name, ">" + group) for name in members]
+    for edge in diagram.edges:
+        source = ">" + edge.source if edge.source in diagram.groups else edge.source
+        target = "<" + edge.target if edge.target in diagram.groups else edge.target
+        layout.edges.append((source, target, item("", edge.lines, 10, 4, _SMALL) if edge.lines else None))
+    layout.place()
+    return layout
+
+
+def svg(diagram: Diagram) -> str:
+    """One line of SVG."""
+    layout = laid_out(diagram)
+
+    def point(at: float, depth: float) -> Point:
+        x, y = (depth, at) if diagram.across else (at, depth)
+        return x + _EDGE, y + _EDGE
+
+    parts: list[str] = []
+    corners: list[Point] = []
+    for group, (low, high, near, far) in layout.boxes.items():
+        a, b = point(low, near), point(high, far)
+        corners += [a, b]
+        parts.append(_rect(a, b, 6, "group"))
+        parts.append(_text((a[0] + 10, a[1] + 17), [diagram.groups[group]], "title"))
+    ports = _ports(layout)
+    texts: list[str] = []
+    for way, edge in zip(layout.ways, diagram.edges, strict=True):
+        points = [point(*place) for place in _course(layout, way, ports)]
+        parts.append(_path(points, edge, diagram.across))
+        corners += points
+        if way.text is not None:
+            middle = point(way.text.at, layout.depths[way.text.rank])
+            wide, high = _size(way.text, diagram.across)
+            a, b = (middle[0] - wide / 2, middle[1] - high / 2), (middle[0] + wide / 2, middle[1] + high / 2)
+            corners += [a, b]
+            texts += [_rect(a, b, 3, "behind"), _text(middle, edge.lines, "edge")]
+    parts += texts
+    for name, node in diagram.nodes.items():
+        item = layout.nodes[name]
+        middle = point(item.at, layout.depths[item.rank])
+        wide, high = _size(item, diagram.across)
+        a, b = (middle[0] - wide / 2, middle[1] - high / 2), (middle[0] + wide / 2, middle[1] + high / 2)
+        corners += [a, b]
+        if node.kind == "start":
+            parts.append(f'<circle class="start" cx="{middle[0]:.1f}" cy="{middle[1]:.1f}" r="7"/>')
+            continue
+        radius = {"state": 9.0, "outside": high / 2, "store": 3.0}.get(node.kind, 3.0)
+        parts.append(_rect(a, b, radius, node.kind))
+        if node.kind == "store":
+            parts += [_line((x, a[1]), (x, b[1])) for x in (a[0] + 5, b[0] - 5)]
+        parts.append(_text(middle, node.lines, "node"))
+    width, height = (max(corner[axis] for corner in corners) + _EDGE for axis in (0, 1))
+    words = escape(", ".join(" ".join(node.lines) for node in diagram.nodes.values() if node.lines[0]), quote=True)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
+        f'role="img" aria-label="Diagram of {words}">{_ARROW}{"".join(parts)}</svg>'
+    )
+
+
+_ARROW = (
+    '<defs><marker id="arrow" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="9" markerHeight="9" '
+    'markerUnits="userSpaceOnUse" orient="auto-start-reverse"><path class="head" d="M0,1 L10,5 L0,9 z"/></marker></defs>'
+)
+
+
+def _size(item: Item, across: bool) -> Point:
+    return (item.depth, item.breadth) if across else (item.breadth, item.depth)
+
+
+def _ports(layout: Layout) -> dict[tuple[int, int], float]:
+    """Where each way leaves (``0``) and reaches (``-1``) its node: side by side, in the order of where they go."""
+    meeting = defaultdict[tuple[Item, bool], list[tuple[float, int, int]]](list)
+    for number, way in enumerate(layout.ways):
+        for end, near in ((0, 1), (-1, -2)):
+            node, after = way.items[end], way.items[near]
+            meeting[node, after.rank > node.rank].append((after.at, number, end))
+    found = {}
+    for (node, _), ways in meeting.items():
+        step = min(16.0, 0.7 * node.breadth / len(ways))
+        for place, (_, number, end) in enumerate(sorted(ways)):
+            found[number, end] = node.at + (place - (len(ways) - 1) / 2) * step
+    return found
+
+
+def _course(layout: Layout, way: Way, ports: dict[tuple[int, int], float]) -> list[Point]:
+    """(across, along) of each point of a way, from border to border."""
+    number = next(place for place, other in enumerate(layout.ways) if other is way)
+    points = [(item.at, layout.depths[item.rank]) for item in way.items]
+    for end, near in ((0, 1), (-1, -2)):
+        node, down = way.items[end], way.items[near].rank > way.items[end].rank
+        depth = layout.depths[node.rank]
+        if node.name.startswith(("<", ">")):
+            _, _, first, last = layout.boxes[node.group]
+            points[end] = (ports[number, end], first if node.name[0] == "<" else last)
+        else:
+            points[end] = (ports[number, end], depth + (1 if down else -1) * node.depth / 2)
+    return points
+
+
+def _path(points: list[Point], edge: Edge, across: bool) -> str:
+    x, y = points[0]
+    d = f"M{x:.1f},{y:.1f}"
+    for nx, ny in points[1:]:
+        one, other = ((x + nx) / 2, y, (x + nx) / 2, ny), (x, (y + ny) / 2, nx, (y + ny) / 2)
+        a, b, c, e = one if across else other
+        d += f" C{a:.1f},{b:.1f} {c:.1f},{e:.1f} {nx:.1f},{ny:.1f}"
+        x, y = nx, ny
+    look = {"=": " thick", ".": " dotted"}.get(edge.look, "")
+    return f'<path class="way{look}" d="{d}" marker-end="url(#arrow)"/>'
+
+
+def _rect(a: Point, b: Point, radius: float, kind: str) -> str:
+    return (
+        f'<rect class="{kind}" x="{a[0]:.1f}" y="{a[1]:.1f}" width="{b[0] - a[0]:.1f}" height="{b[1] - a[1]:.1f}" '
+        f'rx="{radius:g}"/>'
+    )
+
+
+def _line(a: Point, b: Point) -> str:
+    return f'<path class="bar" d="M{a[0]:.1f},{a[1]:.1f} L{b[0]:.1f},{b[1]:.1f}"/>'
+
+
+def _text(middle: Point, lines: list[str] | tuple[str, ...], kind: str) -> str:
+    step = LINE * (_SMALL if kind == "edge" else 1.0)
+    first = middle[1] - (len(lines) - 1) / 2 * step + 4.5
+    return "".join(
+        f'<text class="{kind}" x="{middle[0]:.1f}" y="{first + k * step:.1f}">{escape(line)}</text>'
+        for k, line in enumerate(lines)
+    )
