@@ -40,6 +40,8 @@ class Edge:
 class Diagram:
     across: bool = False
     """From left to right instead of downwards."""
+    begun: bool = False
+    """Begins at the first node: what cannot be reached from there is led back from."""
     nodes: dict[str, Node] = field(default_factory=dict)
     edges: list[Edge] = field(default_factory=list)
     groups: dict[str, str] = field(default_factory=dict)
@@ -58,12 +60,11 @@ def parse(text: str) -> Diagram:
         if opened := _GROUP.match(line):
             group = opened[1]
             made.groups[group] = opened[2]
+            made.nodes.pop(group, None)  # it has been linked to before it was opened
         elif line.strip() == "end":
             group = ""
         else:
             _chain(made, line, group)
-    for name in made.groups:
-        made.nodes.pop(name, None)
     return made
 
 
@@ -72,13 +73,13 @@ def _chain(made: Diagram, line: str, group: str) -> None:
     while at < len(line):
         if (found := _NODE.match(line, at)) is None:
             raise ValueError(f"not understood: {line.strip()}")
-        name, kind = found[1], found.lastgroup
+        name, kind = found[1], next((kind for kind in ("box", "store", "outside") if found[kind] is not None), None)
         if kind is not None:
             made.nodes[name] = Node(found[kind].split("<br>"), kind, group)
         elif name not in made.nodes and name not in made.groups:
             made.nodes[name] = Node([name], "box", group)
         if link is not None:
-            look = (link[1] or link[2])[1].replace("-", "-")
+            look = (link[1] or link[2])[1]
             made.edges.append(Edge(before, name, tuple((link[3] or "").split("<br>")) if link[3] else (), look))
         before, at = name, found.end()
         if not line[at:].strip():
@@ -89,7 +90,7 @@ def _chain(made: Diagram, line: str, group: str) -> None:
 
 
 def _states(lines: list[str]) -> Diagram:
-    made = Diagram()
+    made = Diagram(begun=True)
     for line in lines:
         if line.strip().startswith("direction "):
             made.across = line.strip().endswith("LR")
@@ -99,6 +100,8 @@ def _states(lines: list[str]) -> Diagram:
         for name in found.group(1, 2):
             made.nodes.setdefault(name, Node([""], "start") if name == "[*]" else Node([name], "state"))
         words = [part for text in (found[3] or "").split("<br>") for part in _wrapped(text)]
+        if found[1] == found[2]:
+            words = [part for line in words for part in re.split(r"(?<=/) ", line)]
         made.edges.append(Edge(found[1], found[2], tuple(words)))
     return made
 

@@ -7,13 +7,15 @@ from collections import defaultdict
 from html import escape
 
 from generate.diagram import Diagram, Edge, parse
-from generate.layout import LETTER, LINE, Item, Layout, Way
+from generate.layout import LINE, Item, Layout, Way, width
 
 _FENCE = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _EDGE = 10.0
 """Around all."""
 _SMALL = 0.86
 """Size of texts of edges, against those of nodes."""
+_LOOP = 32.0
+"""Width of the loop of a state that leads to itself."""
 Point = tuple[float, float]
 
 
@@ -24,10 +26,10 @@ def drawn(markdown: str) -> str:
 
 def laid_out(diagram: Diagram) -> Layout:
     """The layout of a diagram; a group that edges lead to has an item ``<NAME`` before it, ``>NAME`` behind it."""
-    layout = Layout()
+    layout = Layout(begun=diagram.begun)
 
     def item(name: str, lines: list[str] | tuple[str, ...], across: float, along: float, scale: float = 1.0) -> Item:
-        wide = max(map(len, lines)) * LETTER * scale + across
+        wide = max(map(width, lines)) * scale + across
         high = len(lines) * LINE * scale + along
         return Item(name, high, wide) if diagram.across else Item(name, wide, high)
 
@@ -35,6 +37,10 @@ def laid_out(diagram: Diagram) -> Layout:
     begins = {edge.source for edge in diagram.edges} & set(diagram.groups)
     for name, node in diagram.nodes.items():
         made = Item(name, 14, 14) if node.kind == "start" else item(name, node.lines, 26, 16)
+        if loops := [edge for edge in diagram.edges if edge.source == edge.target == name]:
+            if diagram.across:
+                raise ValueError(f"{name} leads to itself: that is drawn from top to bottom only")
+            made.breadth += 2 * (_LOOP + max(width(line) for edge in loops for line in edge.lines) * _SMALL)
         made.group = node.group
         layout.nodes[name] = made
     for group in diagram.groups:
@@ -45,12 +51,16 @@ def laid_out(diagram: Diagram) -> Layout:
         if group in begins:
             layout.nodes[">" + group] = Item(">" + group, group=group)
             layout.unseen += [(name, ">" + group) for name in members]
-    for edge in diagram.edges:
+    for edge in _between(diagram):
         source = ">" + edge.source if edge.source in diagram.groups else edge.source
         target = "<" + edge.target if edge.target in diagram.groups else edge.target
         layout.edges.append((source, target, item("", edge.lines, 10, 4, _SMALL) if edge.lines else None))
     layout.place()
     return layout
+
+
+def _between(diagram: Diagram) -> list[Edge]:
+    return [edge for edge in diagram.edges if edge.source != edge.target]
 
 
 def svg(diagram: Diagram) -> str:
@@ -62,15 +72,16 @@ def svg(diagram: Diagram) -> str:
         return x + _EDGE, y + _EDGE
 
     parts: list[str] = []
+    texts: list[str] = []
     corners: list[Point] = []
     for group, (low, high, near, far) in layout.boxes.items():
         a, b = point(low, near), point(high, far)
+        b = (max(b[0], a[0] + width(diagram.groups[group]) + 20), b[1])
         corners += [a, b]
         parts.append(_rect(a, b, 6, "group"))
-        parts.append(_text((a[0] + 10, a[1] + 17), [diagram.groups[group]], "title"))
+        texts.append(_text((a[0] + 10, a[1] + 15), [diagram.groups[group]], "title"))
     ports = _ports(layout)
-    texts: list[str] = []
-    for way, edge in zip(layout.ways, diagram.edges, strict=True):
+    for way, edge in zip(layout.ways, _between(diagram), strict=True):
         points = [point(*place) for place in _course(layout, way, ports)]
         parts.append(_path(points, edge, diagram.across))
         corners += points
@@ -87,6 +98,10 @@ def svg(diagram: Diagram) -> str:
         wide, high = _size(item, diagram.across)
         a, b = (middle[0] - wide / 2, middle[1] - high / 2), (middle[0] + wide / 2, middle[1] + high / 2)
         corners += [a, b]
+        if loops := [edge for edge in diagram.edges if edge.source == edge.target == name]:
+            half = (max(map(width, node.lines)) + 26) / 2
+            a, b = (middle[0] - half, a[1]), (middle[0] + half, b[1])
+            parts.append(_loop(b[0], middle[1], loops))
         if node.kind == "start":
             parts.append(f'<circle class="start" cx="{middle[0]:.1f}" cy="{middle[1]:.1f}" r="7"/>')
             continue
@@ -95,17 +110,18 @@ def svg(diagram: Diagram) -> str:
         if node.kind == "store":
             parts += [_line((x, a[1]), (x, b[1])) for x in (a[0] + 5, b[0] - 5)]
         parts.append(_text(middle, node.lines, "node"))
-    width, height = (max(corner[axis] for corner in corners) + _EDGE for axis in (0, 1))
+    wide, high = (max(corner[axis] for corner in corners) + _EDGE for axis in (0, 1))
     words = escape(", ".join(" ".join(node.lines) for node in diagram.nodes.values() if node.lines[0]), quote=True)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {high:.0f}" width="{wide:.0f}" '
         f'role="img" aria-label="Diagram of {words}">{_ARROW}{"".join(parts)}</svg>'
     )
 
 
 _ARROW = (
     '<defs><marker id="arrow" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="9" markerHeight="9" '
-    'markerUnits="userSpaceOnUse" orient="auto-start-reverse"><path class="head" d="M0,1 L10,5 L0,9 z"/></marker></defs>'
+    'markerUnits="userSpaceOnUse" orient="auto-start-reverse"><path class="head" d="M0,1 L10,5 L0,9 z"/>'
+    "</marker></defs>"
 )
 
 
@@ -144,15 +160,27 @@ def _course(layout: Layout, way: Way, ports: dict[tuple[int, int], float]) -> li
 
 
 def _path(points: list[Point], edge: Edge, across: bool) -> str:
-    x, y = points[0]
-    d = f"M{x:.1f},{y:.1f}"
-    for nx, ny in points[1:]:
-        one, other = ((x + nx) / 2, y, (x + nx) / 2, ny), (x, (y + ny) / 2, nx, (y + ny) / 2)
-        a, b, c, e = one if across else other
-        d += f" C{a:.1f},{b:.1f} {c:.1f},{e:.1f} {nx:.1f},{ny:.1f}"
-        x, y = nx, ny
+    """A smooth line through ``points`` (Catmull and Rom, 1974) that leaves and arrives at right angles."""
+    slopes = [(c[0] - a[0], c[1] - a[1]) for a, c in zip(points, points[2:], strict=False)]
+    first, last = (
+        (1.6 * (b[0] - a[0]), 0.0) if across else (0.0, 1.6 * (b[1] - a[1]))
+        for a, b in ((points[0], points[1]), (points[-2], points[-1]))
+    )
+    slopes = [first, *((x / 2, y / 2) for x, y in slopes), last]
+    d = "M{:.1f},{:.1f}".format(*points[0])
+    for (x, y), (nx, ny), (dx, dy), (ex, ey) in zip(points, points[1:], slopes, slopes[1:], strict=False):
+        d += f" C{x + dx / 3:.1f},{y + dy / 3:.1f} {nx - ex / 3:.1f},{ny - ey / 3:.1f} {nx:.1f},{ny:.1f}"
     look = {"=": " thick", ".": " dotted"}.get(edge.look, "")
     return f'<path class="way{look}" d="{d}" marker-end="url(#arrow)"/>'
+
+
+def _loop(x: float, y: float, edges: list[Edge]) -> str:
+    """Back into the right side of a node; all that lead there have one loop."""
+    far = x + _LOOP - 6
+    way = '<path class="way" d="'
+    way += f'M{x:.1f},{y - 8:.1f} C{far:.1f},{y - 16:.1f} {far:.1f},{y + 16:.1f} {x:.1f},{y + 8:.1f}"'
+    lines = [line for edge in edges for line in edge.lines]
+    return f'{way} marker-end="url(#arrow)"/>' + _text((x + _LOOP - 8, y), lines, "loop")
 
 
 def _rect(a: Point, b: Point, radius: float, kind: str) -> str:
@@ -167,7 +195,7 @@ def _line(a: Point, b: Point) -> str:
 
 
 def _text(middle: Point, lines: list[str] | tuple[str, ...], kind: str) -> str:
-    step = LINE * (_SMALL if kind == "edge" else 1.0)
+    step = LINE * (_SMALL if kind in ("edge", "loop") else 1.0)
     first = middle[1] - (len(lines) - 1) / 2 * step + 4.5
     return "".join(
         f'<text class="{kind}" x="{middle[0]:.1f}" y="{first + k * step:.1f}">{escape(line)}</text>'

@@ -9,14 +9,20 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
-LETTER, LINE = 7.2, 17.0
-"""Size of a letter and a line of text, px."""
-GAP, STEP = 26.0, 17.0
-"""Between neighbours of a rank, and between half ranks."""
-TITLE, PAD = 26.0, 14.0
+LETTER, CAPITAL, LINE = 7.0, 8.8, 17.0
+"""Width of letters, height of a line of text, px."""
+GAP, STEP, TEXT_STEP = 26.0, 17.0, 26.0
+"""Between neighbours of a rank, and between half ranks without texts and with them."""
+TITLE, PAD = 32.0, 14.0
 """Room inside a group: above, where its title is, and at the other sides."""
 SWEEPS = 24
+
+
+def width(line: str) -> float:
+    """About what a line takes, px."""
+    return sum(CAPITAL if letter.isupper() else LETTER for letter in line)
 
 
 @dataclass
@@ -51,7 +57,9 @@ class Way:
 class Layout:
     """Fill ``nodes`` (in their order) and :meth:`edge`, then call :meth:`place`."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, begun: bool = False) -> None:
+        self.begun = begun
+        """Whether all ways begin at the first node."""
         self.nodes: dict[str, Item] = {}
         self.edges: list[tuple[str, str, Item | None]] = []
         self.unseen: list[tuple[str, str]] = []
@@ -96,6 +104,8 @@ class Layout:
 
         for name in self.nodes:
             if name not in state:
+                if state and self.begun:
+                    found.update(k for k, _ in out[name])
                 visit(name)
         return found
 
@@ -123,7 +133,7 @@ class Layout:
             self.ranks[rank].append(point)
             chain.append(point)
         chain.append(last)
-        for one, other in zip(chain, chain[1:], strict=False):
+        for one, other in pairwise(chain):
             weight = 1.0 if one.name and other.name else 2.0 if one.name or other.name else 8.0
             one.links.append((other, weight))
             other.links.append((one, weight))
@@ -157,9 +167,11 @@ class Layout:
 
     def _sort(self, number: int, towards: int) -> None:
         rank = self.ranks[number]
-        places = {item: place for place, item in enumerate(self.ranks[number + towards])} if (
-            0 <= number + towards < len(self.ranks)
-        ) else {}
+        places = (
+            {item: place for place, item in enumerate(self.ranks[number + towards])}
+            if (0 <= number + towards < len(self.ranks))
+            else {}
+        )
         wanted = {}
         for place, item in enumerate(rank):
             near = [places[other] for other, _ in item.links if other in places]
@@ -200,10 +212,28 @@ class Layout:
         for sweep in range(60):
             for rank in self.ranks if sweep % 2 else self.ranks[::-1]:
                 _settle(rank)
+        self._part()
         least = min(item.at - item.breadth / 2 for rank in self.ranks for item in rank)
         for rank in self.ranks:
             for item in rank:
                 item.at -= least
+
+    def _part(self) -> None:
+        """Borders of a group become straight, and what is beside it stays out of it."""
+        for group in dict.fromkeys(item.group for item in self.nodes.values() if item.group):
+            sides = [item for rank in self.ranks for item in rank if item.group == group and item.side]
+            low, high = min(item.at for item in sides), max(item.at for item in sides)
+            for rank in self.ranks:
+                at = [place for place, item in enumerate(rank) if item.group == group and item.side]
+                if not at:
+                    continue
+                rank[at[0]].at, rank[at[1]].at = low, high
+                for way, edge in ((-1, at[0]), (1, at[1])):
+                    before = rank[edge]
+                    for item in rank[edge + way :: way] if 0 <= edge + way < len(rank) else ():
+                        least = before.at + way * ((before.breadth + item.breadth) / 2 + GAP * 0.5)
+                        item.at = max(item.at, least) if way > 0 else min(item.at, least)
+                        before = item
 
     def _deepen(self) -> None:
         groups = {item.group for item in self.nodes.values() if item.group}
@@ -212,10 +242,11 @@ class Layout:
             for group in groups
             if (ranks := [item.rank for item in self.nodes.values() if item.group == group])
         }
+        step = TEXT_STEP if any(text for _, _, text in self.edges) else STEP
         at, thick = 0.0, [max((item.depth for item in rank), default=0.0) for rank in self.ranks]
         for number, depth in enumerate(thick):
             if number:
-                at += STEP + (TITLE if any(first == number for first, _ in spans.values()) else 0.0)
+                at += step + (TITLE if any(first == number for first, _ in spans.values()) else 0.0)
                 at += PAD if any(last == number - 1 for _, last in spans.values()) else 0.0
             elif any(first == 0 for first, _ in spans.values()):
                 at += TITLE
