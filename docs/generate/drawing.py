@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections import defaultdict
 from html import escape
 
@@ -112,14 +113,15 @@ def svg(diagram: Diagram) -> str:
         parts.append(_text(middle, node.lines, "node"))
     wide, high = (max(corner[axis] for corner in corners) + _EDGE for axis in (0, 1))
     words = escape(", ".join(" ".join(node.lines) for node in diagram.nodes.values() if node.lines[0]), quote=True)
-    return (
+    made = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {high:.0f}" width="{wide:.0f}" '
         f'role="img" aria-label="Diagram of {words}">{_ARROW}{"".join(parts)}</svg>'
     )
+    return made.replace("ARROW", f"arrow-{zlib.crc32(made.encode()):08x}")  # one page has several
 
 
 _ARROW = (
-    '<defs><marker id="arrow" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="9" markerHeight="9" '
+    '<defs><marker id="ARROW" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="9" markerHeight="9" '
     'markerUnits="userSpaceOnUse" orient="auto-start-reverse"><path class="head" d="M0,1 L10,5 L0,9 z"/>'
     "</marker></defs>"
 )
@@ -171,7 +173,7 @@ def _path(points: list[Point], edge: Edge, across: bool) -> str:
     for (x, y), (nx, ny), (dx, dy), (ex, ey) in zip(points, points[1:], slopes, slopes[1:], strict=False):
         d += f" C{x + dx / 3:.1f},{y + dy / 3:.1f} {nx - ex / 3:.1f},{ny - ey / 3:.1f} {nx:.1f},{ny:.1f}"
     look = {"=": " thick", ".": " dotted"}.get(edge.look, "")
-    return f'<path class="way{look}" d="{d}" marker-end="url(#arrow)"/>'
+    return f'<path class="way{look}" d="{d}" marker-end="url(#ARROW)"/>'
 
 
 def _loop(x: float, y: float, edges: list[Edge]) -> str:
@@ -180,7 +182,7 @@ def _loop(x: float, y: float, edges: list[Edge]) -> str:
     way = '<path class="way" d="'
     way += f'M{x:.1f},{y - 8:.1f} C{far:.1f},{y - 16:.1f} {far:.1f},{y + 16:.1f} {x:.1f},{y + 8:.1f}"'
     lines = [line for edge in edges for line in edge.lines]
-    return f'{way} marker-end="url(#arrow)"/>' + _text((x + _LOOP - 8, y), lines, "loop")
+    return f'{way} marker-end="url(#ARROW)"/>' + _text((x + _LOOP - 8, y), lines, "loop")
 
 
 def _rect(a: Point, b: Point, radius: float, kind: str) -> str:
