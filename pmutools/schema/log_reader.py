@@ -176,6 +176,7 @@ class _Walk:
         self.size = size
         self.damage = damage
         self.wanted = wanted
+        self.unknown = unknown
         self.at = len(raw.MAGIC)
         """Where the next record begins."""
         self.schemas: dict[int, str] = {0: ""}
@@ -206,7 +207,7 @@ class _Walk:
         """
         if self.all_known:
             return None
-        ahead = _Walk(self.file, self.size, Damage(), ())
+        ahead = _Walk(self.file, self.size, Damage(), (), set())
         ahead.at, ahead.schemas, ahead.channels, ahead.all_known = (
             self.at,
             dict(self.schemas),

@@ -7,7 +7,19 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench import capture, characterizing, codec, control, measuring, pacing, reading, receiving, startup, table
+from bench import (
+    analyzing,
+    capture,
+    characterizing,
+    codec,
+    control,
+    measuring,
+    pacing,
+    reading,
+    receiving,
+    startup,
+    table,
+)
 from bench.layouts import BLOCK, LAYOUTS
 from bench.table import Row
 
@@ -21,6 +33,7 @@ def measured(*, quick: bool) -> Iterator[Row]:
     yield from capture.rows(capture.QUICK if quick else capture.FULL)
     yield from startup.rows(startup.QUICK if quick else startup.FULL)
     yield from control.rows(control.QUICK if quick else control.FULL)
+    yield from analyzing.rows(analyzing.QUICK if quick else analyzing.FULL)
     yield from measuring.rows(measuring.QUICK if quick else measuring.FULL)
     yield from receiving.rows(receiving.QUICK if quick else receiving.FULL)
     yield from reading.rows(reading.QUICK if quick else reading.FULL)
