@@ -65,7 +65,7 @@ def command(
     elif result.different:
         click.echo(f"{result.different} of {result.ticks} ticks differ; first: {result.first}")
     else:
-        click.echo(f"{result.ticks} ticks: identical")
+        click.echo(f"{result.ticks} ticks: identical" if result.ticks else "no tick could be replayed")
     if result.newer:
         talk.say(f"warning: {sessions[0]} {result.newer}")
     for problem in result.problems:

@@ -103,11 +103,13 @@ def planned(
 
 
 def absolute_ns(record: Record, times_s: Floats) -> npt.NDArray[np.int64]:
+    """POSIX UTC (N,) of times in seconds from the record's start."""
     absolute: npt.NDArray[np.int64] = record.start_ns + np.rint(times_s * NS).astype(np.int64)
     return absolute
 
 
 def rows_of(record: Record, time_ns: npt.NDArray[np.int64], values: Mapping[str, Floats]) -> Rows:
+    """Frames (N,) at ``time_ns`` of columns (N,) by name."""
     count = len(time_ns)
     quality = np.full(count, record.time_quality, np.uint8)
     frames = FrameValues(time_ns, np.full(count, NO_TIME), np.full(count, stamp_code(None), np.uint8), quality)

@@ -82,6 +82,7 @@ def _triples(waves: Sequence[_Wave]) -> list[tuple[int, int, int]]:
 
 
 def waveform_source(path: Path, record: Record, nominal: Nominal) -> TableSource:
+    """Phasors estimated from a record of waveforms; raises what :func:`~pmutools.formats.comtrade.read` does."""
     nominal_hz = nominal.fnom_hz or line_hz(record)
     if nominal_hz is None:
         raise SourceError(f"{path}: its header says {record.line_hz:g} Hz; choose a nominal frequency of 50 or 60 Hz")
