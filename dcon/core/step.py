@@ -225,8 +225,10 @@ def _record(
         age_ms=tuple([math.nan if pmu.arrival_ns is None else (now_ns - pmu.time_ns) / 1e6 for pmu in state.pmus]),
         instances=tuple(
             [
-                _new(InstanceRecord, (instance.state, index == active, instance.delta_f_mhz, mw, instance.reason))
-                for index, (instance, mw) in enumerate(zip(state.instances, own_mw, strict=True))
+                _new(InstanceRecord, (at, index == active, delta_f_mhz, mw, reason))
+                for index, ((at, _, _, delta_f_mhz, reason, _, _, _), mw) in enumerate(
+                    zip(state.instances, own_mw, strict=True)
+                )
             ]
         ),
         events=tuple(events),

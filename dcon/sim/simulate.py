@@ -276,7 +276,8 @@ def _note(outcome: Outcome, record: Record) -> None:
     outcome.tick_s.append(time_s)
     outcome.delta_f_mhz.append(record.delta_f_mhz)
     outcome.command_mw.append(record.command_mw)
-    outcome.events.extend((time_s, event) for event in record.events)
+    if record.events:
+        outcome.events.extend((time_s, event) for event in record.events)
     outcome.final_state = str(record.state)
 
 

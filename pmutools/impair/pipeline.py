@@ -35,6 +35,8 @@ from pmutools.impair.transmission import NO_DELAY, Transmission
 from pmutools.timebase import NS
 
 _TYPES = (*FrameType, FrameType.COMMAND, FrameType.COMMAND)
+_SENT = Fate.SENT  # looking a member up takes longer than comparing it
+_new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 """By bits 6-4 of SYNC; the two undefined values pass as commands."""
 
 
@@ -247,7 +249,7 @@ class Pipeline:
             else:
                 self._others += 1
                 self._fresh = self._fresh or frame_type.is_config
-            return (Outgoing(index, 0, data, offset_ns + delay_ns, Fate.SENT, delay_ns, tag=tag),)
+            return (_new(Outgoing, (index, 0, data, offset_ns + delay_ns, _SENT, delay_ns, (), None, True, None, tag)),)
         time_ns = offset_ns if stream_ns is None else stream_ns
         self._time_ns, self._offset_ns = time_ns, offset_ns
         while self._actions and self._actions[0].at_ns <= time_ns:
