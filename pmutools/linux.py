@@ -104,6 +104,16 @@ def _may_lock_memory() -> bool:
     return bool(masks and masks[0] >> cap_ipc_lock & 1)
 
 
+def end_with_parent(number: int) -> str | None:
+    """Have the kernel send this process signal ``number`` when its parent's thread ends. None, or why not."""
+    if libc is None:
+        return "end with the parent: only Linux has it"
+    pr_set_pdeathsig = 1
+    if libc.prctl(pr_set_pdeathsig, ctypes.c_ulong(number), 0, 0, 0):
+        return f"end with the parent: {os.strerror(ctypes.get_errno())}"
+    return None
+
+
 # --- clock quality -----------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -17,18 +18,23 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.parsers import number
 
 if TYPE_CHECKING:
-    from dcon.platform.loop import Platform
+    from dcon.engine import Tick
+    from dcon.link.notify import Notifier
+    from dcon.platform.loop import Platform, Summary
+    from dcon.settings import Settings
 
 
 @click.command(name="platform", short_help="The real-time controller: PMU streams in, command out, session log.")
 @click.option("--ini", required=True, metavar="FILE")
-@click.option("--log", metavar="FILE", help="Session log; default: [log] path.")
+@click.option("--run-dir", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Be one of several.")
+@click.option("--log", metavar="FILE", help="Session log; default: [log] path. Not with --run-dir.")
 @click.option("--duration", type=Parsed(number(1e-3, 1e9)), metavar="S", help="Stop S seconds after --start.")
 @click.option("--start", metavar="UTC", help="What --duration and --order count from; default: now.")
 @click.option("--order", "orders", multiple=True, metavar="S:NAME[=VALUE]", help="An order for later; repeatable.")
 @common
 def command(
     ini: str,
+    run_dir: Path | None,
     log: str | None,
     duration: float | None,
     start: str | None,
@@ -37,13 +43,17 @@ def command(
     quiet: bool,
     verbose: int,
 ) -> int:
-    """Run the controller: PMU streams in, 60 ticks a second, the command out over UDP, everything logged.
+    """Run the controller: PMU streams in, 60 ticks a second, the command out, everything logged.
+
+    Alone it receives, drives [output] and writes the session log itself. With --run-dir (or [platform] run_dir) it is
+    one of several processes that meet in that folder: the command goes to the watchdog, the log to the server. `dcon
+    run` starts them all.
 
     Ctrl-C ramps the command down, which takes a second, and ends; a second Ctrl-C ends at once.
 
-    Research software. There is no watchdog and no operator link yet; orders are given beforehand with --order.
+    Research software: it has never moved a real HVDC line.
     """
-    from dcon.platform.loop import Platform
+    from dcon.link.notify import STOPPING, Notifier
     from dcon.platform.orders import parse_order
     from dcon.settings import load
     from pmutools.timebase import parse_utc
@@ -55,23 +65,84 @@ def command(
         start_ns = None if start is None else parse_utc(start)
     except ValueError as error:
         raise SettingsError(f"--start: {error}") from None
-    path = log or settings.log.path
-    platform = Platform(settings)
-    with _stopped_by_signals(platform):
-        summary = platform.run(path, orders=timed, start_ns=start_ns, duration_s=duration)
+    folder = run_dir or settings.platform.run_dir
+    if folder is not None and log is not None:
+        raise SettingsError("--log: with a run folder the server writes the log; set [log] path for it")
+    notifier = Notifier()
+    with _session(settings, Path(ini), folder, log or settings.log.path, notifier) as platform:
+        summary = platform.run(orders=timed, start_ns=start_ns, duration_s=duration)
+    notifier.tell(STOPPING)
     if as_json:
         click.echo(json.dumps(asdict(summary)))
-    talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}; session log {path}")
+    return _told(summary, settings, talk, stopped=platform.stopping)
+
+
+def _told(summary: Summary, settings: Settings, talk: Talk, *, stopped: bool) -> int:
+    where = f"; session log {summary.log_parts[0]}" if summary.log_parts else ""
+    talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}{where}")
     if len(summary.log_parts) > 1:
         talk.say(f"in {len(summary.log_parts)} parts, the last {summary.log_parts[-1]}")
     if summary.unlogged_ticks:
         talk.complain(f"{summary.unlogged_ticks} ticks were not logged")
-    if platform.stopping:
+    if summary.trouble:
+        raise SourceError(summary.trouble)
+    if stopped:
         return Exit.INTERRUPTED
     if not summary.frames:
-        where = ", ".join(str(site.url) for site in settings.sites)
-        raise SourceError(f"no frame came from any PMU ({where}); are they on, and the ports and IDCODEs right?")
+        urls = ", ".join(str(site.url) for site in settings.sites)
+        raise SourceError(f"no frame came from any PMU ({urls}); are they on, and the ports and IDCODEs right?")
     return Exit.INCOMPLETE if summary.unlogged_ticks else Exit.DONE
+
+
+@contextmanager
+def _session(
+    settings: Settings, ini: Path, folder: Path | None, log_path: str, notifier: Notifier
+) -> Iterator[Platform]:
+    """A platform that signals end: alone, or with its children in a run folder."""
+    from dcon.platform.loop import SPIN_NS, Platform
+    from pmutools.clock import SystemClock
+
+    clock = SystemClock(spin_ns=SPIN_NS)
+    ticked = _Herald(notifier)
+    if folder is None:
+        from dcon.platform.alone import own_ends
+
+        platform = Platform(settings, own_ends(settings, clock, log_path), clock, ticked=ticked)
+        with _stopped_by_signals(platform):
+            yield platform
+        return
+    from dcon.link.paths import prepare
+    from dcon.platform.linked import Linked
+
+    linked = Linked(settings, ini, prepare(folder), clock)
+    platform = Platform(settings, linked.ends, clock, ticked=ticked)
+    with _stopped_by_signals(platform):
+        try:
+            linked.wait(lambda: platform.stopping)
+        except BaseException:
+            linked.ends.close()
+            raise
+        yield platform
+
+
+class _Herald:
+    """Tells systemd, once a second, that ticks are run, and in which state."""
+
+    PERIOD_NS = 1_000_000_000
+
+    def __init__(self, notifier: Notifier) -> None:
+        self._notifier = notifier
+        self._told_ns: int | None = None
+
+    def __call__(self, tick: Tick, now_ns: int) -> None:
+        from dcon.link.notify import ALIVE, READY
+
+        if self._told_ns is not None and now_ns - self._told_ns < self.PERIOD_NS:
+            return
+        first, self._told_ns = self._told_ns is None, now_ns
+        record = tick.record
+        status = f"{record.state} {record.mode}, {record.output_v:.2f} V"
+        self._notifier.tell(*((READY,) if first else ()), ALIVE, status=status)
 
 
 @contextmanager

@@ -12,8 +12,13 @@ from support.swing import MS, START_NS, Streams
 
 from dcon.core.values import Record
 from dcon.platform import loop
+from dcon.platform.alone import OwnFrames
 from dcon.platform.loop import Platform, Summary
 from dcon.platform.orders import TimedOrder, parse_order
+from dcon.platform.ports import Ends
+from dcon.platform.receiving import Reception
+from dcon.session.head import Head
+from dcon.session.rolling import RollingWriter
 from dcon.session.log import SessionReader
 from dcon.session.replay import replay
 from pmutools.c37118 import Demux, Loss, Message, StreamConfig
@@ -66,6 +71,7 @@ class Script:
         self.demux = Demux()
         self.waiting: deque[tuple[int, Item]] = deque()
         self.closed = False
+        self.unwanted = 0
 
     def play(self, items: Iterable[tuple[int, Item]]) -> None:
         """Items with their arrival, in ns of unstepped UTC."""
@@ -138,13 +144,16 @@ class Bench:
         self.script = Script(self.clock)
         self.script.play(items)
         self.driver = Driver(self.clock)
-        self.platform = Platform(
-            STREAMS.settings(extra=f"\n[output]\nurl = udp://127.0.0.1:9\n[platform]\nfifo = no\n{platform}"),
-            clock=self.clock,
-        )
+        settings = STREAMS.settings(extra=f"\n[output]\nurl = udp://127.0.0.1:9\n[platform]\nfifo = no\n{platform}")
+
+        def open_log(head: Head) -> RollingWriter:
+            return RollingWriter(self.path, head)
+
+        frames = OwnFrames(Reception(self.script), self.clock)  # type: ignore[arg-type]
+        self.platform = Platform(settings, Ends(frames, open_log, self.driver), self.clock)
 
     def run(self, duration_s: float | None, orders: Sequence[TimedOrder] = ORDERS) -> Summary:
-        return self.platform.run(str(self.path), orders=orders, start_ns=START_NS, duration_s=duration_s)
+        return self.platform.run(orders=orders, start_ns=START_NS, duration_s=duration_s)
 
     @property
     def records(self) -> list[Record]:
@@ -165,10 +174,5 @@ def virtual_platform(
     path: Path, items: Iterable[tuple[int, Item]], monkeypatch: pytest.MonkeyPatch, platform: str = ""
 ) -> Bench:
     """``platform`` are more lines of ``[platform]``."""
-    monkeypatch.setattr(loop, "Receivers", lambda endpoints, clock: Script(clock))
-    monkeypatch.setattr(loop, "UdpCommandDriver", lambda endpoint: None)
     monkeypatch.setattr(loop, "prepare", lambda *, fifo: None)
-    made = Bench(path, items, platform)
-    made.platform.receivers = made.script  # type: ignore[assignment]
-    made.platform.driver = made.driver  # type: ignore[assignment]
-    return made
+    return Bench(path, items, platform)

@@ -1,0 +1,139 @@
+"""From the front to the control process: what has come for a tick, as a few messages of a socket pair.
+
+A message is records end to end, at most :data:`MESSAGE_BYTES`, big-endian::
+
+    B kind | B stamp source | H PMU (its place in the settings) | q arrival_ns | I size | the record's bytes
+
+A configuration precedes the data frames that it rules, in the same message or in an earlier one.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from enum import IntEnum
+from typing import NamedTuple
+
+from pmutools.c37118 import Frame
+from pmutools.flow import StampSource
+from pmutools.net.dialogue import LinkEvent, LinkKind
+
+MESSAGE_BYTES = 96 << 10
+"""A configuration frame of 64 KiB fits, and the default send buffer of a socket takes two such messages."""
+_HEAD = struct.Struct(">BBHqI")
+_SOURCES = tuple(StampSource)
+_SOURCE_NUMBERS = {source: number for number, source in enumerate(_SOURCES)}
+
+
+class Kind(IntEnum):
+    """What a record is."""
+
+    DATA = 0
+    """A data frame that is to be read by the PMU's newest configuration."""
+    CONFIG = 1
+    """A configuration frame that says something new."""
+    NEWS = 2
+    """A :class:`~pmutools.net.dialogue.LinkEvent`, as JSON."""
+    COUNTS = 3
+    """:class:`Counts` so far, as JSON."""
+    FAILED = 4
+    """The front cannot go on: why, as text."""
+
+
+@dataclass
+class Counts:
+    """What did not become frames of a tick, since the start."""
+
+    foreign: int = 0
+    """Frames that no PMU of the settings sends: another IDCODE, or another source."""
+    undecodable: int = 0
+    """Runs of bytes in no frame."""
+    own_drops: int = 0
+    """Datagrams that a full receive buffer of this machine has lost."""
+    crowded: int = 0
+    """Frames that the control process did not take in time."""
+
+
+class PmuFrameIn(NamedTuple):
+    """A frame of the PMU at a place of the settings; ``is_config`` says which kind."""
+
+    pmu: int
+    frame: Frame
+    is_config: bool = False
+
+
+class Failure(NamedTuple):
+    """The front has ended, and why."""
+
+    reason: str
+
+
+Item = PmuFrameIn | LinkEvent | Counts | Failure
+
+
+def encode(items: Iterable[Item]) -> Iterator[tuple[bytes, list[Item]]]:
+    """Messages that carry ``items``, in order, each with what is in it."""
+    records: list[bytes] = []
+    inside: list[Item] = []
+    size = 0
+    for item in items:
+        record = _record(item)
+        if inside and size + len(record) > MESSAGE_BYTES:
+            yield b"".join(records), inside
+            records, inside, size = [], [], 0
+        records.append(record)
+        inside.append(item)
+        size += len(record)
+    if inside:
+        yield b"".join(records), inside
+
+
+def _record(item: Item) -> bytes:
+    match item:
+        case PmuFrameIn(pmu, frame, is_config):
+            kind = Kind.CONFIG if is_config else Kind.DATA
+            source = _SOURCE_NUMBERS[frame.stamp_source]
+            return _HEAD.pack(kind, source, pmu, frame.arrival_ns or 0, len(frame.data)) + frame.data
+        case LinkEvent():
+            said = {"kind": item.kind, "where": item.where, "detail": item.detail, "datagrams": item.datagrams}
+            return _text(Kind.NEWS, json.dumps(said))
+        case Counts():
+            return _text(Kind.COUNTS, json.dumps(asdict(item)))
+        case Failure(reason):
+            return _text(Kind.FAILED, reason)
+
+
+def _text(kind: Kind, text: str) -> bytes:
+    data = text.encode()
+    return _HEAD.pack(kind, 0, 0, 0, len(data)) + data
+
+
+def decode(message: bytes) -> Iterator[Item]:
+    """The items of a message. Raises ValueError for one that the front cannot have sent."""
+    at = 0
+    while at < len(message):
+        try:
+            kind, source, pmu, arrival_ns, size = _HEAD.unpack_from(message, at)
+        except struct.error:
+            raise ValueError(f"a record's head is cut off at byte {at}") from None
+        at += _HEAD.size
+        data = message[at : at + size]
+        at += size
+        if len(data) < size:
+            raise ValueError(f"a record of {size} bytes is cut off")
+        if kind <= Kind.CONFIG:
+            if source >= len(_SOURCES):
+                raise ValueError(f"no stamp source {source}")
+            yield PmuFrameIn(pmu, Frame(data, arrival_ns, _SOURCES[source], 0), kind == Kind.CONFIG)
+        elif kind == Kind.NEWS:
+            said = json.loads(data)
+            yield LinkEvent(LinkKind(said["kind"]), said["where"], (), said["detail"], datagrams=said["datagrams"])
+        elif kind == Kind.COUNTS:
+            said = json.loads(data)
+            yield Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})
+        elif kind == Kind.FAILED:
+            yield Failure(data.decode(errors="replace"))
+        else:
+            raise ValueError(f"no record of kind {kind}")

@@ -1,0 +1,83 @@
+"""Processes that another one starts, and that must not outlive it."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+from pmutools import linux
+
+LOG = logging.getLogger(__name__)
+PATIENCE_S = 3.0
+
+
+def launch(
+    arguments: Sequence[str], *, dies_by: signal.Signals = signal.SIGKILL, pass_fds: Sequence[int] = (), **given: object
+) -> subprocess.Popen[str]:
+    """``python ARGUMENTS`` in a process group of its own: Ctrl-C at the terminal is for its parent to pass on.
+
+    It gets ``dies_by`` should this process end before it.
+    """
+
+    def bind() -> None:
+        linux.end_with_parent(dies_by)
+
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        stdin=subprocess.DEVNULL,
+        text=True,
+        pass_fds=pass_fds,
+        process_group=0,
+        preexec_fn=bind,  # single-threaded still: nothing holds a lock between fork and exec
+        **given,  # type: ignore[call-overload]
+    )
+
+
+class Children:
+    """The control process's own: the kernel tells when one ends, so nobody has to ask.
+
+    One at a time in a process: it takes SIGCHLD, and gives it back when it is closed.
+    """
+
+    def __init__(self) -> None:
+        self.processes: dict[str, subprocess.Popen[str]] = {}
+        self._rang = False
+        self._before = signal.signal(signal.SIGCHLD, self._ring)
+
+    def start(self, name: str, arguments: Sequence[str], pass_fds: Sequence[int] = ()) -> None:
+        self.processes[name] = launch(arguments, pass_fds=pass_fds)
+
+    def trouble(self) -> str:
+        """Who has ended, in words; "" while all are there."""
+        if not self._rang:
+            return ""
+        self._rang = False
+        for name, process in self.processes.items():
+            if process.poll() is not None:
+                self._rang = True
+                return f"the {name} process has ended, {ending(process.returncode)}"
+        return ""
+
+    def close(self) -> None:
+        for process in self.processes.values():
+            process.kill()  # they hold nothing that an orderly end would save
+        for process in self.processes.values():
+            process.wait(PATIENCE_S)
+        signal.signal(signal.SIGCHLD, self._before)
+
+    def _ring(self, signum: int, frame: FrameType | None) -> None:
+        self._rang = True
+
+
+def ending(code: int | None) -> str:
+    """How a process ended, for people."""
+    if code is not None and code < 0:
+        try:
+            return f"by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"by signal {-code}"
+    return f"exit code {code}"

@@ -1,0 +1,123 @@
+"""The front as a process: PMU streams in, frames out to the control process that has started it.
+
+``python -m dcon.platform.front --ini FILE --fd N --run-dir DIR``, with one end of a SEQPACKET socket pair inherited as
+descriptor N. Its loops ``udp`` and ``parse`` take turns in one thread, and each beats to the watchdog. It never waits
+for the control process: data frames that the pair has no room for are counted, configurations and news are kept. It
+ends when the pair does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, encode
+from dcon.link.paths import WATCHDOG, Sender
+from dcon.platform.beating import Beater
+from dcon.platform.receiving import Reception
+from dcon.settings import load
+from pmutools.clock import Clock, SystemClock
+from pmutools.errors import PmuError
+from pmutools.net.receiver import Receivers
+from pmutools.realtime import go_realtime
+
+ROUND_NS = 10_000_000
+"""The longest that a round waits for something to come."""
+KEPT = 1000
+"""Configurations and news that may wait for room in the pair; the oldest go first."""
+COUNTS_NS = 500_000_000
+PRIORITY = 9
+"""One below the control process."""
+
+
+class Outlet:
+    """One end of the pair. ``counts.crowded`` is what it had no room for."""
+
+    def __init__(self, sock: socket.socket, counts: Counts) -> None:
+        sock.setblocking(False)
+        self._sock = sock
+        self._counts = counts
+        self._items: list[Item] = []
+        self.is_open = True
+        """Somebody is there to take what comes."""
+
+    def add(self, item: Item) -> None:
+        """For the next :meth:`flush`."""
+        self._items.append(item)
+
+    def flush(self) -> None:
+        items, self._items = self._items, []
+        for message, inside in encode(items):
+            try:
+                self._sock.send(message)
+            except BlockingIOError:
+                self._keep(inside)
+            except OSError:
+                self.is_open = False
+
+    def _keep(self, items: list[Item]) -> None:
+        for item in items:
+            if isinstance(item, PmuFrameIn) and not item.is_config:
+                self._counts.crowded += 1
+            elif not isinstance(item, Counts):
+                self._items.append(item)
+        del self._items[:-KEPT]
+
+
+class Front:
+    """Both loops, in turn, until nobody takes what they find."""
+
+    def __init__(self, reception: Reception, outlet: Outlet, beat: Callable[[str], object], clock: Clock) -> None:
+        """``beat`` takes the name of a loop that has done a turn."""
+        self.reception, self.outlet, self._beat, self._clock = reception, outlet, beat, clock
+        self._counted_ns = 0
+
+    def run(self) -> None:
+        while self.outlet.is_open:
+            self.turn()
+
+    def turn(self) -> None:
+        reception, outlet = self.reception, self.outlet
+        received = reception.receive(ROUND_NS)
+        self._beat("udp")
+        reception.parse(received, outlet.add)
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - self._counted_ns >= COUNTS_NS:
+            self._counted_ns = now_ns
+            outlet.add(Counts(**vars(reception.counts)))  # it also finds out whether anybody is there
+        outlet.flush()
+        self._beat("parse")
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="dcon.platform.front")
+    parser.add_argument("--ini", required=True)
+    parser.add_argument("--fd", type=int, required=True)
+    parser.add_argument("--run-dir", type=Path, required=True)
+    given = parser.parse_args(arguments)
+    sock = socket.socket(fileno=given.fd)
+    counts = Counts()
+    outlet = Outlet(sock, counts)
+    clock = SystemClock()
+    try:
+        settings = load(given.ini)
+        receivers = Receivers([site.endpoint for site in settings.sites], clock)
+    except PmuError as error:
+        outlet.add(Failure(str(error)))
+        outlet.flush()
+        return 1
+    reception = Reception(receivers, counts)
+    try:
+        beater = Beater(Sender(given.run_dir / WATCHDOG), clock)
+        go_realtime(fifo=settings.platform.fifo, priority=PRIORITY)
+        Front(reception, outlet, beater.beat, clock).run()
+    finally:
+        reception.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,243 @@
+"""The control loop's ends where it is one process of several: the front's socket pair and the sockets of the run folder.
+
+Every call returns at once; what is not taken is counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import socket
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from dcon.core.values import NOTHING, Order, Record, Surroundings
+from dcon.drivers.udp_command import CommandOut, encode
+from dcon.frontend import Reading
+from dcon.limiter import MW_PER_V
+from dcon.link import paths
+from dcon.link.crossing import Counts, Failure, Item, decode
+from dcon.link.paths import Sender
+from dcon.link.shipper import Ring, Shipper
+from dcon.link.shipping import Shipping
+from dcon.platform.beating import Beater
+from dcon.platform.children import Children
+from dcon.platform.news import Heard, hear, is_old, surroundings
+from dcon.platform.ports import Ends, Told
+from dcon.session.codec import Timing
+from dcon.session.encode import tick_entries
+from dcon.session.head import Head
+from dcon.settings import Settings
+from pmutools.clock import Clock
+from pmutools.errors import SourceError
+from pmutools.net.sockets import raise_sndbuf
+
+LOG = logging.getLogger(__name__)
+PAIR_BYTES = 4 << 20
+"""Asked for in the pair: seconds of eight PMUs."""
+MESSAGES_A_TICK = 64
+"""Of the front; what is left waits in the pair."""
+LARGEST_BYTES = 1 << 18
+NEWS_A_TICK = 64
+LAST_S = 5.0
+"""How long, at the end, the server is given to store what it does not have yet."""
+HEALTHY_S = 10.0
+"""How long, at the start, the watchdog is waited for."""
+ROUND_NS = 16_666_667
+NEWS_BYTES = 1 << 16
+
+
+class PairFrames:
+    """What the front found since the last tick."""
+
+    def __init__(self, sock: socket.socket, clock: Clock) -> None:
+        sock.setblocking(False)
+        self._sock, self._clock = sock, clock
+        self.counts = Counts()
+        self._early: list[Item] = []
+
+    def until(self, deadline_ns: int) -> Sequence[Item]:
+        self._clock.sleep_until(deadline_ns)
+        items, self._early = self._early, []
+        items += self._drained()
+        return items
+
+    def keep(self) -> None:
+        """Take what is there now, for the first tick. Raises SourceError where the front could not start."""
+        for item in self._drained():
+            if isinstance(item, Failure):
+                raise SourceError(item.reason)
+            self._early.append(item)
+
+    def _drained(self) -> Iterable[Item]:
+        for _ in range(MESSAGES_A_TICK):
+            try:
+                message = self._sock.recv(LARGEST_BYTES)
+            except OSError:
+                return
+            if not message:  # the front has ended: the kernel says so to its parent too
+                return
+            for item in decode(message):
+                if isinstance(item, Counts):
+                    self.counts = item
+                else:
+                    yield item
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+class WatchdogCommand:
+    """The command, and with it the control loop's sign of life, to the watchdog."""
+
+    def __init__(self, sender: Sender, beater: Beater, clock: Clock) -> None:
+        self._sender, self._beater, self._clock = sender, beater, clock
+        self._sequence = 0
+        self.failed = 0
+        self.sent_ns = 0
+        """When the last command left, monotonic."""
+
+    def send(self, time_ns: int, output_v: float, flags: int = 0) -> None:
+        self.sent_ns = self._clock.monotonic_ns()
+        datagram = encode(CommandOut(self._sequence, time_ns, output_v * MW_PER_V, output_v, flags))
+        self._sequence += 1
+        self.failed += not self._sender.send(datagram)
+        self._beater.beat("control")
+
+    def close(self) -> None:
+        self._sender.close()
+
+
+class RunNews:
+    """``control.in``, and whether the processes that this one has started are there still."""
+
+    def __init__(self, sock: socket.socket, children: Children, command: WatchdogCommand, clock: Clock) -> None:
+        self._sock, self._children, self._command = sock, children, command
+        self._orders: list[Order] = []
+        self.heard = Heard(clock.monotonic_ns())
+
+    def listen(self, now_ns: int) -> None:
+        """Take what there is."""
+        for _ in range(NEWS_A_TICK):
+            try:
+                datagram = self._sock.recv(NEWS_BYTES)
+            except OSError:
+                return
+            self.heard, order = hear(self.heard, datagram, now_ns)
+            if order is not None:
+                self._orders.append(order)
+
+    def told(self, now_ns: int) -> Told:
+        self.listen(now_ns)
+        orders, self._orders = tuple(self._orders), []
+        around = surroundings(self.heard, now_ns, self._command.sent_ns)
+        return Told(orders, around, self._children.trouble())
+
+    def close(self) -> None:
+        paths.release(self._sock)
+        self._children.close()
+
+
+class ShippedLog:
+    """The session log, by way of the server."""
+
+    parts: tuple[str, ...] = ()
+
+    def __init__(self, head: Head, settings: Settings, server: Path, clock: Clock) -> None:
+        session = random.getrandbits(32)  # tells this session from the one before, to a server that was there
+        limits = settings.log
+        ring = Ring(round(limits.backfill_s * 1e9), round(limits.backfill_mb * 1e6))
+        self._instances = head.instances
+        self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
+        self._clock = clock
+
+    def config(self, name: str, frame: bytes, time_ns: int) -> None:
+        self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
+
+    def tick(
+        self,
+        record: Record,
+        readings: Iterable[Reading],
+        orders: Iterable[Order],
+        *,
+        timing: Timing | None = None,
+        surroundings: Surroundings = NOTHING,
+    ) -> None:
+        entries = tick_entries(self._instances, record, readings, orders, timing=timing, surroundings=surroundings)
+        now_ns = self._clock.monotonic_ns()
+        self._shipping.shipper.tick(record.tick_ns, entries, now_ns)
+        self._shipping.service(now_ns)
+
+    @property
+    def unlogged_ticks(self) -> int:
+        """Bundles that the server does not have, and cannot get any more."""
+        ring = self._shipping.shipper.ring
+        return ring.dropped + len(ring)
+
+    def close(self) -> None:
+        shipper = self._shipping.shipper
+        shipper.end(self._clock.monotonic_ns())
+        end_s = time.monotonic() + LAST_S
+        while len(shipper.ring) and time.monotonic() < end_s:
+            self._shipping.service(self._clock.monotonic_ns())
+            time.sleep(0.01)
+        self._shipping.close()
+
+
+class Linked:
+    """Starts the front and the aides, and joins the control loop to them and to the run folder."""
+
+    def __init__(self, settings: Settings, ini: Path, folder: Path, clock: Clock) -> None:
+        """Raises SourceError where another control process lives in the folder."""
+        self._clock = clock
+        inbox = paths.bind_datagram(folder, paths.CONTROL)
+        self._sender = Sender(folder / paths.WATCHDOG)
+        command = self._command = WatchdogCommand(self._sender, Beater(self._sender, clock), clock)
+        self._children = Children()
+        ours, theirs = pair()
+        self._frames = PairFrames(ours, clock)
+        self._news = RunNews(inbox, self._children, command, clock)
+        self.ends = Ends(
+            self._frames, lambda head: ShippedLog(head, settings, folder / paths.SERVER, clock), command, self._news
+        )
+        here = ("--ini", str(ini), "--run-dir", str(folder))
+        try:
+            with theirs:
+                front = ("-m", "dcon.platform.front", *here, "--fd", str(theirs.fileno()))
+                self._children.start("front", front, (theirs.fileno(),))
+            self._children.start("aides", ("-m", "dcon.platform.aides", *here))
+        except BaseException:
+            self.ends.close()
+            raise
+
+    def wait(self, stopping: Callable[[], bool]) -> None:
+        """Drive 0 V and beat until the watchdog finds everybody well, so that the first tick finds it healthy.
+
+        Where that takes too long the session begins without, and shows it. Raises SourceError where the front or the
+        aides cannot start.
+        """
+        clock = self._clock
+        now_ns = clock.monotonic_ns()
+        end_ns = now_ns + round(HEALTHY_S * 1e9)
+        while not stopping():
+            self._command.send(clock.realtime_ns(), 0.0)
+            self._frames.keep()
+            self._news.listen(now_ns)
+            if trouble := self._children.trouble():
+                self._frames.keep()  # its last words
+                raise SourceError(trouble)
+            if self._news.heard.healthy and not is_old(self._news.heard, now_ns):
+                return
+            if now_ns >= end_ns:
+                LOG.warning("the watchdog is not healthy after %g s; it says why", HEALTHY_S)
+                return
+            clock.sleep_until(now_ns + ROUND_NS)
+            now_ns = clock.monotonic_ns()
+
+
+def pair() -> tuple[socket.socket, socket.socket]:
+    """(control's end, front's end): sequenced packets, with room for seconds."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    raise_sndbuf(theirs, PAIR_BYTES)
+    return ours, theirs

@@ -1,0 +1,137 @@
+"""What the control process is told besides frames, and what its ticks make of it: functions of news and time only.
+
+News come as datagrams to ``control.in``. The newest of each kind counts, and for how long is decided here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from dcon.core.values import NOTHING, Order, Pdci, Surroundings
+from dcon.link import beats
+
+STATUS_NS = 100_000_000
+"""A watchdog that has said nothing for so long is not healthy."""
+GPS_NS = 3_000_000_000
+"""A lock that nobody has spoken of for so long is getting old."""
+SERVER_NS = 3_000_000_000
+"""What the server has found out is not told any longer once it has been silent for so long."""
+RELEASED = 0b111
+"""Emergency stop: in software, line a, line b."""
+
+
+class Heard(NamedTuple):
+    """The newest of every kind, each with the monotonic time at which it was heard (0: the start)."""
+
+    started_ns: int
+    gps_age_s: float | None = None
+    gps_ns: int = 0
+    healthy: bool = False
+    estop_released: bool | None = None
+    status_ns: int | None = None
+    """Stamp of the watchdog's status, by its own clock: the same one."""
+    pdci: Pdci | None = None
+    readback_v: float | None = None
+    readback_ns: int = 0
+    """Stamp of the readback, likewise."""
+    server_ns: int | None = None
+    disk_free_percent: float | None = None
+    response_gain: float | None = None
+    response_lag_ms: float | None = None
+    ignored: int = 0
+    """Datagrams that say nothing which is known here."""
+
+
+class Said(NamedTuple):
+    """What one datagram changes."""
+
+    heard: Heard
+    order: Order | None = None
+
+
+def hear(heard: Heard, datagram: bytes, now_ns: int) -> Said:
+    """What is known after a datagram that was taken at ``now_ns`` (monotonic). Never raises: what makes no sense is
+    counted."""
+    if (status := beats.decode_status(datagram)) is not None:
+        released = status.estop & RELEASED == RELEASED
+        return Said(heard._replace(healthy=status.healthy, estop_released=released, status_ns=status.monotonic_ns))
+    if (readback := beats.decode_readback(datagram)) is not None:
+        return Said(heard._replace(readback_v=readback.volts, readback_ns=readback.monotonic_ns))
+    try:
+        said = json.loads(datagram)
+        return _KINDS[said["kind"]](heard, said, now_ns)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return Said(heard._replace(ignored=heard.ignored + 1))
+
+
+def _gps(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
+    return Said(heard._replace(gps_age_s=_number(said["age_s"]), gps_ns=now_ns))
+
+
+def _pdci(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
+    scheduled_mw = said.get("scheduled_mw")
+    pdci = Pdci(
+        int(said["time_ns"]),
+        _number(said["power_mw"]),
+        said["in_service"] is True,
+        said["dcon_enabled"] is True,
+        math.nan if scheduled_mw is None else _number(scheduled_mw),
+    )
+    return Said(heard._replace(pdci=pdci))
+
+
+def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
+    name, text, who = (said.get(key, "") for key in ("name", "text", "who"))
+    if not (isinstance(name, str) and isinstance(text, str) and isinstance(who, str)):
+        raise TypeError("an order is words")
+    return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who))
+
+
+def _server(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
+    disk, gain, lag = (said.get(key) for key in ("disk_free_percent", "response_gain", "response_lag_ms"))
+    numbers = (None if value is None else _number(value) for value in (disk, gain, lag))
+    return Said(heard._replace(server_ns=now_ns)._replace(**dict(zip(_FOUND, numbers, strict=True))))
+
+
+_FOUND = ("disk_free_percent", "response_gain", "response_lag_ms")
+_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server}
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
+    """What a tick that begins at ``now_ns`` is told, the last command having left at ``sent_ns`` (monotonic).
+
+    A readback counts only where it was taken after that: an older one answers an older command.
+    """
+    server_ns = heard.started_ns if heard.server_ns is None else heard.server_ns
+    told = NOTHING._replace(
+        gps_age_s=_gps_age_s(heard, now_ns),
+        watchdog_healthy=heard.healthy and not is_old(heard, now_ns),
+        estop_released=heard.estop_released,
+        pdci=heard.pdci,
+        readback_v=heard.readback_v if heard.readback_ns >= sent_ns else None,
+        server_age_s=max(now_ns - server_ns, 0) / 1e9,
+    )
+    if now_ns - server_ns > SERVER_NS:
+        return told
+    return told._replace(**{name: getattr(heard, name) for name in _FOUND})
+
+
+def is_old(heard: Heard, now_ns: int) -> bool:
+    """Whether the watchdog has said nothing for too long."""
+    return heard.status_ns is None or now_ns - heard.status_ns > STATUS_NS
+
+
+def _gps_age_s(heard: Heard, now_ns: int) -> float | None:
+    if heard.gps_age_s is None:
+        return None
+    silent_ns = now_ns - heard.gps_ns
+    return heard.gps_age_s + (silent_ns / 1e9 if silent_ns > GPS_NS else 0.0)

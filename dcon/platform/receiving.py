@@ -1,0 +1,67 @@
+"""From sockets to frames of the settings' PMUs, in one thread: receive, then parse, in turn.
+
+The kernel stamps arrivals, so parsing costs no stamp its exactness. What is not of a configured source and IDCODE goes
+no further. One round takes at most 256 datagrams from each port (:data:`pmutools.net.udp.READ_BATCHES`), so a flood of
+one port holds up the frames of the others by the time that those take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dcon.link.crossing import Counts, Item, PmuFrameIn
+from pmutools.c37118 import FrameType, Loss, Message, StreamConfig, decode_config
+from pmutools.c37118.config import encode_config
+from pmutools.errors import WireError
+from pmutools.flow import Chunk
+from pmutools.net.dialogue import LinkEvent
+from pmutools.net.receiver import Receivers
+
+
+class Reception:
+    """The two loops of the front: :meth:`receive` and :meth:`parse`."""
+
+    def __init__(self, receivers: Receivers, counts: Counts | None = None) -> None:
+        self.receivers = receivers
+        self.counts = Counts() if counts is None else counts
+        self._configs: dict[int, StreamConfig] = {}
+
+    def receive(self, timeout_ns: int) -> list[Chunk | LinkEvent]:
+        """What has come; waits for it at most ``timeout_ns``."""
+        return self.receivers.poll(timeout_ns)
+
+    def parse(self, received: Sequence[Chunk | LinkEvent], take: Callable[[Item], object]) -> None:
+        """Hand ``take`` the frames that are somebody's, and the news, in order."""
+        receivers, counts = self.receivers, self.counts
+        for item in received:
+            if not isinstance(item, Chunk):
+                counts.own_drops += item.datagrams
+                take(item)
+            for found in receivers.parse(item):
+                if isinstance(found, Loss):
+                    counts.undecodable += 1
+                else:
+                    self._route(found, take)
+        counts.foreign = receivers.unwanted
+
+    def _route(self, message: Message, take: Callable[[Item], object]) -> None:
+        frame, flow, config = message
+        for owner in self.receivers.owners(flow, frame.idcode):
+            if frame.type is FrameType.DATA:
+                take(PmuFrameIn(owner, frame))
+            elif config is not None and frame.type.rules_data and self._configs.get(owner) != config:
+                self._configs[owner] = config
+                take(PmuFrameIn(owner, frame._replace(data=_whole(frame.data, config)), is_config=True))
+
+    def close(self) -> None:
+        self.receivers.close()
+
+
+def _whole(data: bytes, config: StreamConfig) -> bytes:
+    """A frame that says ``config`` by itself: that which came, unless it was the last of several."""
+    try:
+        if decode_config(data)[1] == config:
+            return data
+    except WireError:
+        pass
+    return encode_config(config)
