@@ -28,6 +28,7 @@ LAYERS = [
     # the controller
     ["dcon", "dcon.limiter"],
     ["dcon.core"],
+    ["dcon.link"],
     ["dcon.supervisor", "dcon.watchdog"],
     ["dcon.settings", "dcon.frontend"],
     ["dcon.effective", "dcon.engine"],

@@ -1,1 +1,1 @@
-"""What the processes of the platform say to each other: codecs, and sockets that never wait."""
+"""What the processes of the platform say to each other: pure codecs, and the thin ends of sockets."""

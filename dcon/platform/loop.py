@@ -29,6 +29,7 @@ from dcon.platform.schedule import TickGrid
 from dcon.platform.waiting import Waiting
 from dcon.session.codec import Timing
 from dcon.session.head import Head
+from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.c37118 import Frame, decode_config
 from pmutools.clock import Clock, UtcOffset, utc_offset
@@ -141,8 +142,17 @@ class Platform:
         prepare(fifo=settings.platform.fifo)
         log: Log | None = None
         try:
-            log = self.ends.open_log(head)
-            self._loop(log, OrderBook(orders, start_ns), end_ns)
+            head = Head(
+                settings.text,
+                tuple(site.name for site in settings.sites),
+                settings.params.instance_names,
+                CORE.names,
+                {"start_ns": str(start_ns)},
+                settings.probe_file,
+            )
+            limits = settings.log
+            with RollingWriter(log_path, head, max_mb=limits.max_mb, max_minutes=limits.max_minutes) as writer:
+                self._loop(writer, OrderBook(orders, start_ns), end_ns)
         finally:
             gc.unfreeze()
             self.ends.command.send(self.clock.realtime_ns(), 0.0)

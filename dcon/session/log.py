@@ -1,150 +1,25 @@
-"""A session as MCAP: every tick with the frames and orders it was given, and what it decided.
+"""Reading a session log: every tick with the frames and orders it was given, and what it decided.
 
 Which frames a tick consumed is part of the log (``tick_ns`` in each), so a replay groups by tick, never by arrival.
-All messages of a tick lie in one chunk: damage takes whole ticks, and the reader says where.
 """
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import pmutools
 from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surroundings
 from dcon.session import codec
-from dcon.session.codec import Timing, Watchdog
+from dcon.session.codec import Timing
+from dcon.session.head import INI_NAME, PROBE_NAME
 from dcon.session.parts import SESSION, Part, Paths, is_apart, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
-from pmutools.schema.log_writer import LogWriter
 from pmutools.schema.messages import MESSAGES
-from pmutools.schema.pmu_log import Loggable, PmuFrame, PmuTopics, config_name, from_message, name_of
-
-INI_NAME = "dcon.ini"
-PROBE_NAME = "probing.csv"
-
-
-class SessionWriter:
-    """Writes a session log; a context manager. All methods raise SourceError where the system refuses to write.
-
-    Parameters
-    ----------
-    target
-        Path, or a seekable binary stream.
-    ini_text
-        The initialisation file in force, attached whole.
-    configs
-        Configuration frame of each PMU, by name; those that come later go to :meth:`config`.
-    metadata
-        Seed, plant, scenario and what else is known of the run, as text; the version is added.
-    probe_file
-        What the file of ``[probing]`` holds, attached; empty for none.
-    pmus, instances, flags
-        Names, in the order of the lists in a :class:`~dcon.core.values.Record` and of the bits in its ``flags``.
-    """
-
-    def __init__(
-        self,
-        target: str | os.PathLike[str] | IO[bytes],
-        *,
-        ini_text: str,
-        configs: Mapping[str, bytes],
-        metadata: Mapping[str, str],
-        pmus: Sequence[str],
-        instances: Sequence[str],
-        flags: Sequence[str] = (),
-        probe_file: bytes = b"",
-    ) -> None:
-        self._log = LogWriter(target)
-        self._pmus = PmuTopics(self._log)
-        self._instances = tuple(instances)
-        names = {
-            "pmus": json.dumps(list(pmus)),
-            "instances": json.dumps(list(instances)),
-            "flags": json.dumps(list(flags)),
-        }
-        self._log.metadata(SESSION, {"version": pmutools.__version__, **metadata, **names})
-        self._log.attach(INI_NAME, ini_text.encode(), media_type="text/plain")
-        if probe_file:
-            self._log.attach(PROBE_NAME, probe_file, media_type="text/csv")
-        for name, frame in configs.items():
-            self._pmus.config(name, frame)
-        self._channels = {
-            name: self._log.channel(message.topic, name, names)
-            for name, message in MESSAGES.items()
-            if message.topic.startswith("/dcon/")
-        }
-
-    def tick(
-        self,
-        record: Record,
-        frames: Iterable[Loggable] = (),
-        orders: Iterable[Order] = (),
-        *,
-        timing: Timing | None = None,
-        pdci: Pdci | None = None,
-        surroundings: Surroundings = NOTHING,
-    ) -> None:
-        """Log one tick: the ``frames``, ``orders`` and ``surroundings`` it was given, what it decided, how it ran.
-
-        ``pdci`` is the line's status beside the tick; by default the one that the tick was told.
-
-        ``frames`` in the order in which the controller got them. Ticks are POSIX times: a frame's tick 0 means none.
-        """
-        tick_ns = record.tick_ns
-        if tick_ns <= 0:
-            raise ValueError(f"tick_ns is {tick_ns}")
-        self._log.checkpoint(tick_ns)
-        for frame in frames:
-            self._pmus.write(frame, tick_ns)
-        for order in orders:
-            self._write("Setting", codec.encode_order(tick_ns, order), tick_ns)
-        if surroundings != NOTHING:
-            self._write("Surroundings", codec.encode_surroundings(tick_ns, surroundings), tick_ns)
-            pdci = pdci or surroundings.pdci
-        self._write("Tick", codec.encode_tick(record, self._instances), tick_ns)
-        self._write("Instance", codec.encode_instances(record), tick_ns)
-        for event in record.events:
-            self._write("Event", codec.encode_event(tick_ns, event), tick_ns)
-        for flag in record.flag_changes:
-            self._write("Flag", codec.encode_flag(tick_ns, flag), tick_ns)
-        if timing is not None:
-            self._write("Timing", codec.encode_timing(tick_ns, timing), tick_ns)
-        if pdci is not None:
-            self._write("Pdci", codec.encode_pdci(tick_ns, pdci), tick_ns, pdci.time_ns)
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file; grows with every chunk that is flushed."""
-        return self._log.size
-
-    def config(self, name: str, frame: bytes, time_ns: int) -> None:
-        """Attach a configuration frame that came at ``time_ns``."""
-        self._pmus.config(name, frame, time_ns)
-
-    def watchdog(self, watchdog: Watchdog) -> None:
-        self._write("Watchdog", codec.encode_watchdog(watchdog), watchdog.time_ns)
-
-    def flush(self) -> None:
-        """A process killed after this loses nothing that was logged before it."""
-        self._log.flush()
-
-    def close(self) -> None:
-        self._log.close()
-
-    def __enter__(self) -> SessionWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    def _write(self, message: str, data: bytes, time_ns: int, publish_time_ns: int | None = None) -> None:
-        self._log.write(self._channels[message], data, time_ns, time_ns if publish_time_ns is None else publish_time_ns)
+from pmutools.schema.pmu_log import PmuFrame, config_name, from_message, name_of
 
 
 class LoggedTick(NamedTuple):

@@ -12,13 +12,18 @@ import logging
 import os
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 from dcon.core.values import NOTHING, Event, Order, Pdci, Record, Surroundings
+from dcon.link.bundle import Entry
+from dcon.session import codec
 from dcon.session.codec import Timing, Watchdog
-from dcon.session.log import SessionWriter
+from dcon.session.encode import tick_entries
+from dcon.session.head import Head
 from dcon.session.parts import SESSION, part_path
+from dcon.session.writer import SessionWriter
 from pmutools.errors import SourceError
 from pmutools.schema.pmu_log import Loggable
 from pmutools.timebase import NS
@@ -33,48 +38,46 @@ LOG_SUBJECT = "log"
 class RollingWriter:
     """Writes a session log in parts (:mod:`dcon.session.parts`); a context manager, used as a :class:`SessionWriter`.
 
-    Only making one raises SourceError, where the first part cannot be written at all.
+    Only making one raises SourceError, where the first part cannot be written at all, and not with ``patient``.
 
     Parameters
     ----------
     path
         Of the first part.
+    head, configs
+        As for :class:`SessionWriter`; they go into every part, with the newest configurations.
     max_mb, max_minutes
         A part that has so many bytes (in millions, compressed) or spans so much of the ticks' time is ended, between
         two ticks; infinity for no limit.
     session_id
         What the parts have in common; unless given, one that no other session has.
-    ini_text, configs, metadata, pmus, instances, flags, probe_file
-        As for :class:`SessionWriter`; they go into every part, with the newest configurations.
+    parts
+        Those of the session that there are already.
+    patient
+        The first part is begun by the first tick, and tried again where it cannot be written, as any other.
     """
 
     def __init__(
         self,
         path: str | os.PathLike[str],
+        head: Head,
+        configs: Mapping[str, bytes] | None = None,
         *,
-        ini_text: str,
-        configs: Mapping[str, bytes],
-        metadata: Mapping[str, str],
-        pmus: Sequence[str],
-        instances: Sequence[str],
-        flags: Sequence[str] = (),
-        probe_file: bytes = b"",
         max_mb: float = float("inf"),
         max_minutes: float = float("inf"),
         session_id: str | None = None,
+        parts: Sequence[Path] = (),
+        patient: bool = False,
     ) -> None:
         self.path = Path(path)
-        self.parts: list[Path] = []
+        self.parts = list(parts)
         """Of the session so far."""
         self.unlogged_ticks = 0
         """In the whole session."""
         self._max_bytes = max_mb * 1e6
         self._max_ns = max_minutes * 60 * NS
-        self._ini_text = ini_text
-        self._probe_file = probe_file
-        self._configs = {name: (frame, 0) for name, frame in configs.items()}
-        self._metadata = {**metadata, SESSION: session_id or uuid.uuid4().hex}
-        self._names = {"pmus": tuple(pmus), "instances": tuple(instances), "flags": tuple(flags)}
+        self._head = replace(head, metadata={**head.metadata, SESSION: session_id or uuid.uuid4().hex})
+        self._configs = {name: (frame, 0) for name, frame in (configs or {}).items()}
         self._log: SessionWriter | None = None
         self._begun_ns = 0
         """First tick of the part."""
@@ -85,7 +88,8 @@ class RollingWriter:
         self._reason = ""
         self._missing = 0
         """Ticks that are not logged since the last that is."""
-        self._open()
+        if not patient:
+            self._open()
 
     def tick(
         self,
@@ -98,18 +102,22 @@ class RollingWriter:
         surroundings: Surroundings = NOTHING,
     ) -> None:
         """Log one tick, as :meth:`SessionWriter.tick` does; or count it."""
-        now_ns = record.tick_ns
+        instances = self._head.instances
+        entries = tick_entries(instances, record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
+        self.write(entries, record.tick_ns)
+
+    def write(self, entries: Sequence[Entry], now_ns: int) -> None:
+        """Log the entries of the tick at ``now_ns``, or count it."""
         log = self._log or self._next_part(now_ns)
         if log is None:
-            self._missing += 1
-            self.unlogged_ticks += 1
+            self._count(1)
             return
         if self._missing and not self._written:
             gap = Event("log_gap", LOG_SUBJECT, f"{self._missing} ticks were not logged: {self._reason}")
-            record = record._replace(events=(*record.events, gap))
+            entries = (*entries, Entry("Event", "", codec.encode_event(now_ns, gap), now_ns, now_ns))
         size = log.size
         try:
-            log.tick(record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
+            log.write(entries, now_ns)
         except SourceError as error:
             self._refused(error, now_ns, self._open_ticks + 1)
             return
@@ -140,6 +148,32 @@ class RollingWriter:
                 log.watchdog(watchdog)
             except SourceError as error:
                 self._refused(error, watchdog.time_ns, self._open_ticks)
+
+    def lost(self, ticks: int, reason: str, now_ns: int) -> None:
+        """``ticks`` will not come: what is logged next begins a part that says so."""
+        if self._log is not None:
+            self._end_part(self._log, now_ns)
+        self._reason = reason
+        self._count(ticks)
+
+    def flush(self, now_ns: int) -> None:
+        """A process killed after this loses nothing that was logged before it."""
+        if self._log is not None:
+            try:
+                self._log.flush()
+                self._flushed()
+            except SourceError as error:
+                self._refused(error, now_ns, self._open_ticks)
+
+    @property
+    def size(self) -> int | None:
+        """Bytes of the part under way that are written; None where there is none."""
+        return None if self._log is None else self._log.size
+
+    @property
+    def is_refused(self) -> bool:
+        """The system lets us write nothing at present."""
+        return self._tried_ns is not None
 
     def close(self) -> None:
         if self._log is not None:
@@ -179,14 +213,8 @@ class RollingWriter:
             head |= {"continues": self.parts[-1].name, "first": self.parts[0].name}
         self.parts.append(part_path(self.path, number))
         self._written = self._open_ticks = 0
-        self._log = SessionWriter(
-            self.parts[-1],
-            ini_text=self._ini_text,
-            configs={},
-            metadata=self._metadata | head,
-            probe_file=self._probe_file,
-            **self._names,
-        )
+        metadata = {**self._head.metadata, **head}
+        self._log = SessionWriter(self.parts[-1], replace(self._head, metadata=metadata))
         for name, (frame, time_ns) in self._configs.items():
             self._log.config(name, frame, time_ns)
 
@@ -204,10 +232,13 @@ class RollingWriter:
         if self._tried_ns is None:
             LOG.error("%s; control goes on, and ticks that are not logged are counted", error)
         self._reason = str(error).rpartition(": ")[2]
-        self._missing += ticks
-        self.unlogged_ticks += ticks
+        self._count(ticks)
         self._tried_ns = now_ns
         self._log = None
         if self._written == self._open_ticks:  # a part that holds nothing gives its room and its number back
             with contextlib.suppress(OSError):
                 self.parts.pop().unlink()
+
+    def _count(self, ticks: int) -> None:
+        self._missing += ticks
+        self.unlogged_ticks += ticks

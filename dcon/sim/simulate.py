@@ -17,7 +17,8 @@ from dcon.core.rows import CORE
 from dcon.core.values import Event, Mode, Pdci, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
-from dcon.session.log import SessionWriter
+from dcon.session.head import Head
+from dcon.session.writer import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
 from dcon.sim.operator import EagerOperator
@@ -153,15 +154,9 @@ def simulate(plan: Plan, log_path: str | None = None, tell: Tell | None = None) 
             "delay_ms": repr(plan.delay_ms),
             "verified": "true",
         }
-        with SessionWriter(
-            log_path,
-            ini_text=settings.text,
-            configs=configs,
-            metadata=metadata,
-            pmus=[pmu.name for pmu in pmus],
-            instances=settings.params.instance_names,
-            flags=CORE.names,
-        ) as log:
+        names = tuple(pmu.name for pmu in pmus)
+        head = Head(settings.text, names, settings.params.instance_names, CORE.names, metadata)
+        with SessionWriter(log_path, head, configs) as log:
             _run(plan, delays, senders, engine, outcome, log, tell)
     outcome.peak_command_mw = max(map(abs, outcome.command_mw), default=0.0)
     if plan.course.ringdown_s is not None:

@@ -94,13 +94,16 @@ class PmuTopics:
 
     def write(self, frame: Loggable, tick_ns: int = 0) -> None:
         """Log one frame, at its arrival (or its own time); ``tick_ns`` overrides the frame's."""
-        channel = self._channels.get(frame.name)
-        if channel is None:
-            described = self._described.get(frame.name, {})
-            channel = self.log.channel(topic_of(frame.name), "PmuFrame", described)
-            self._channels[frame.name] = channel
         time_ns = frame.time_ns
-        self.log.write(channel, frame.encode(tick_ns), frame.arrival_ns or time_ns, time_ns)
+        self.put(frame.name, frame.encode(tick_ns), frame.arrival_ns or time_ns, time_ns)
+
+    def put(self, name: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        """Log one frame that is a ``PmuFrame`` message already."""
+        channel = self._channels.get(name)
+        if channel is None:
+            described = self._described.get(name, {})
+            channel = self._channels[name] = self.log.channel(topic_of(name), "PmuFrame", described)
+        self.log.write(channel, data, log_time_ns, publish_time_ns)
 
 
 def encode_frame(frame: PmuFrame, tick_ns: int = 0) -> bytes:

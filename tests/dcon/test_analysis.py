@@ -17,6 +17,7 @@ from dcon.analysis.course import Stretch
 from dcon.analysis.figures import SHADES, bars, thinned
 from dcon.analysis.report import main_findings
 from dcon.cli import dcon
+from dcon.session.head import Head
 from dcon.session.log import SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import START_NS, Plan
@@ -152,16 +153,8 @@ def test_frames_lost_and_doubled_are_counted(tmp_path: Path) -> None:
 
 def test_a_session_in_parts_is_one(closed: Path, tmp_path: Path) -> None:
     reader = SessionReader(closed)
-    with RollingWriter(
-        tmp_path / "s.mcap",
-        ini_text=reader.ini_text,
-        configs=reader.configs,
-        metadata={},
-        pmus=reader.pmus,
-        instances=reader.instances,
-        flags=reader.flags,
-        max_minutes=0.2,
-    ) as log:
+    head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags)
+    with RollingWriter(tmp_path / "s.mcap", head, reader.configs, max_minutes=0.2) as log:
         for tick in reader.ticks():
             log.tick(tick.record, tick.frames, tick.orders)
     assert len(log.parts) == 3

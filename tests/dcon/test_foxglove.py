@@ -17,6 +17,7 @@ from support.sessions import PERIOD_NS, T0
 
 from dcon.limiter import MW_PER_V
 from dcon.session.codec import Timing, Watchdog
+from dcon.session.head import Head
 from dcon.session.log import SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import Plan
@@ -36,9 +37,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     simulate(Plan(duration_s=2), str(folder / "simulated.mcap"))
     reader = SessionReader(folder / "simulated.mcap")
     names = {"pmus": reader.pmus, "instances": reader.instances, "flags": reader.flags}
-    with RollingWriter(
-        folder / "live.mcap", ini_text=reader.ini_text, configs=reader.configs, metadata={}, max_minutes=1 / 60, **names
-    ) as log:
+    head = Head(reader.ini_text, **names)
+    with RollingWriter(folder / "live.mcap", head, reader.configs, max_minutes=1 / 60) as log:
         for number, tick in enumerate(reader.ticks()):
             if number % 60 == 0:
                 log.watchdog(Watchdog(T0 + number * PERIOD_NS, True, heartbeats=(("control", 1.0),)))

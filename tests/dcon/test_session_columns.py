@@ -14,6 +14,7 @@ import pytest
 from support.sessions import INSTANCES, PMUS, T0, bits, open_session, random_ticks, write_session
 from support.virtual_platform import stream, virtual_platform
 
+from dcon.link.bundle import Entry
 from dcon.session import columns as columns_module
 from dcon.session.codec import Watchdog
 from dcon.session.columns import (
@@ -25,9 +26,12 @@ from dcon.session.columns import (
     SessionColumns,
     read_columns,
 )
-from dcon.session.log import LoggedTick, SessionReader, SessionWriter
+from dcon.session.encode import tick_entries
+from dcon.session.head import Head
+from dcon.session.log import LoggedTick, SessionReader
 from dcon.session.parts import Paths
 from dcon.session.rolling import RollingWriter
+from dcon.session.writer import SessionWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 from pmutools.errors import SourceError
@@ -132,7 +136,7 @@ def test_a_session_in_parts(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     ticks = random_ticks(300)
     names = {"pmus": PMUS, "instances": INSTANCES}
-    with RollingWriter(path, ini_text="", configs={}, metadata={}, max_minutes=1 / 40, **names) as log:
+    with RollingWriter(path, Head("", **names), max_minutes=1 / 40) as log:
         for tick in ticks:
             log.tick(tick.record, tick.frames, tick.orders)
     assert len(log.parts) == 4
@@ -183,13 +187,12 @@ def test_a_live_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ticks_that_are_not_whole(tmp_path: Path) -> None:
-    from dcon.session import codec
-
     ticks = random_ticks(20)
     with open_session(tmp_path / "s.mcap") as log:
         for number, tick in enumerate(ticks):
             if number % 5 == 3:
-                log._write("Tick", codec.encode_tick(tick.record, INSTANCES), tick.record.tick_ns)
+                alone = [entry for entry in tick_entries(INSTANCES, tick.record) if entry.message == "Tick"]
+                log.write(alone, tick.record.tick_ns)
             else:
                 log.tick(tick.record)
     session = read_columns(tmp_path / "s.mcap")
@@ -206,7 +209,7 @@ def test_states_of_a_newer_version_and_messages_that_are_none(tmp_path: Path) ->
             if number == 7:
                 record = record._replace(state="HIBERNATING")
             if number == 9:
-                log._write("Tick", b"\xff\xff", record.tick_ns)
+                log.write([Entry("Tick", "", b"\xff\xff", record.tick_ns, record.tick_ns)], record.tick_ns)
             log.tick(record)
     session = read_columns(tmp_path / "s.mcap")
     assert session.tick.state[7] == UNKNOWN and (session.tick.state[8:] != UNKNOWN).all()
@@ -255,7 +258,7 @@ def test_memory_is_that_of_the_columns_and_a_batch(
     reader = SessionReader(simulated)
     ticks = list(reader.ticks())[-300:]
     names = {"pmus": reader.pmus, "instances": reader.instances}
-    with SessionWriter(path, ini_text="", configs={}, metadata={}, **names) as log:
+    with SessionWriter(path, Head("", **names)) as log:
         for number in range(1500):
             tick = ticks[number % len(ticks)]
             record = tick.record._replace(tick_ns=T0 + number * 16_666_667, events=())

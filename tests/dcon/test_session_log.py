@@ -17,6 +17,7 @@ import pytest
 from support.sessions import (
     CONFIGS,
     FLAGS,
+    HEAD,
     INI,
     INSTANCES,
     METADATA,
@@ -33,7 +34,9 @@ from support.sessions import (
 import pmutools
 from dcon.core.values import Inputs, Sample
 from dcon.session.codec import Watchdog
-from dcon.session.log import LoggedTick, SessionReader, SessionWriter
+from dcon.session.encode import tick_entries
+from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.writer import SessionWriter
 from pmutools.errors import SourceError
 from pmutools.schema.log_writer import LogWriter
 from pmutools.schema.messages import MESSAGES
@@ -209,13 +212,13 @@ def test_a_damaged_head_does_not_hide_the_session(tmp_path: Path) -> None:
 
 
 def test_a_tick_of_which_a_part_is_missing_is_counted_and_left_out(tmp_path: Path) -> None:
-    from dcon.session import codec
 
     ticks = random_ticks(3)
     path = tmp_path / "s.mcap"
     with open_session(path) as session:
         session.tick(ticks[0].record)
-        session._write("Tick", codec.encode_tick(ticks[1].record, INSTANCES), ticks[1].record.tick_ns)
+        whole = tick_entries(INSTANCES, ticks[1].record)
+        session.write([entry for entry in whole if entry.message == "Tick"], ticks[1].record.tick_ns)
         session.tick(ticks[2].record)
     reader = SessionReader(path)
     assert [(tick.record.tick_ns, tick.after_loss) for tick in reader.ticks()] == [
@@ -281,9 +284,7 @@ class FullDisk(io.BytesIO):
 def test_a_full_disk_is_one_line_and_leaves_what_was_flushed(tmp_path: Path) -> None:
     disk = FullDisk()
     ticks = random_ticks(600)
-    session = SessionWriter(
-        disk, ini_text=INI, configs=CONFIGS, metadata=METADATA, pmus=PMUS, instances=INSTANCES, flags=FLAGS
-    )
+    session = SessionWriter(disk, HEAD, CONFIGS)
     with pytest.raises(SourceError, match="cannot write: No space left on device"), session:
         for tick in ticks:
             session.tick(tick.record, tick.frames)

@@ -12,6 +12,7 @@ from support.disk import full_disk
 from support.sessions import (
     CONFIGS,
     FLAGS,
+    HEAD,
     INI,
     INSTANCES,
     METADATA,
@@ -26,6 +27,7 @@ from support.sessions import (
 
 from dcon.cli import dcon
 from dcon.session.export import export
+from dcon.session.head import Head
 from dcon.session.log import LoggedTick, SessionReader
 from dcon.session.parts import part_path
 from dcon.session.rolling import RETRY_NS, RollingWriter
@@ -39,16 +41,7 @@ TICKS = random_ticks(400)
 
 
 def rolling(path: Path, **limits: Any) -> RollingWriter:
-    return RollingWriter(
-        path,
-        ini_text=INI,
-        configs=CONFIGS,
-        metadata=METADATA,
-        pmus=PMUS,
-        instances=INSTANCES,
-        flags=FLAGS,
-        **limits,
-    )
+    return RollingWriter(path, HEAD, CONFIGS, **limits)
 
 
 def written(path: Path, ticks: list[Tick] = TICKS, **limits: Any) -> RollingWriter:
@@ -226,14 +219,12 @@ def session(tmp_path: Path) -> list[Path]:
     simulate(Plan(gain_mw_per_mhz=12, duration_s=7), str(tmp_path / "whole.mcap"))
     reader = SessionReader(tmp_path / "whole.mcap")
     names = ("pmus", "instances", "flags")
+    metadata = {key: value for key, value in reader.metadata.items() if key not in names}
+    head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags, metadata)
     with RollingWriter(
         tmp_path / "s.mcap",
-        ini_text=reader.ini_text,
-        configs=reader.configs,
-        metadata={key: value for key, value in reader.metadata.items() if key not in names},
-        pmus=reader.pmus,
-        instances=reader.instances,
-        flags=reader.flags,
+        head,
+        reader.configs,
         max_minutes=1 / 30,
     ) as log:
         for tick in reader.ticks():

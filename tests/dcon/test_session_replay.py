@@ -12,8 +12,10 @@ import pytest
 from dcon.cli import dcon
 from dcon.core.values import Event, Order, Record
 from dcon.session import codec
-from dcon.session.log import LoggedTick, SessionReader, SessionWriter
+from dcon.session.head import Head
+from dcon.session.log import LoggedTick, SessionReader
 from dcon.session.replay import identical, replay
+from dcon.session.writer import SessionWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run
@@ -40,15 +42,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def rewritten(session: Path, out: Path, edit: Edit = lambda tick: tick, ini: str | None = None) -> Path:
     """The session written anew, every tick through ``edit``."""
     reader = SessionReader(session)
-    with SessionWriter(
-        out,
-        ini_text=reader.ini_text if ini is None else ini,
-        configs=reader.configs,
-        metadata={key: value for key, value in reader.metadata.items() if key not in ("pmus", "instances", "flags")},
-        pmus=reader.pmus,
-        instances=reader.instances,
-        flags=reader.flags,
-    ) as log:
+    metadata = {key: value for key, value in reader.metadata.items() if key not in ("pmus", "instances", "flags")}
+    head = Head(reader.ini_text if ini is None else ini, reader.pmus, reader.instances, reader.flags, metadata)
+    with SessionWriter(out, head, reader.configs) as log:
         for number, tick in enumerate(reader.ticks()):
             changed = edit(tick) if number == EDITED else tick
             log.tick(changed.record, changed.frames, changed.orders, timing=changed.timing)
@@ -280,7 +276,7 @@ def foreign(path: Path) -> None:
 
 
 def no_ini(path: Path) -> None:
-    with SessionWriter(path, ini_text="", configs={}, metadata={}, pmus=(), instances=()):
+    with SessionWriter(path, Head("")):
         pass
 
 
@@ -308,7 +304,7 @@ def test_what_is_no_session_fails_in_one_line(
 def test_a_session_without_ticks(session: Path, tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "x.mcap"
     reader = SessionReader(session)
-    with SessionWriter(path, ini_text=reader.ini_text, configs={}, metadata={}, pmus=reader.pmus, instances=()):
+    with SessionWriter(path, Head(reader.ini_text, reader.pmus)):
         pass
     code, _, err = told(capsys, str(path))
     assert code == 1 and err == f"dcon: {path}: holds no tick\n"
@@ -348,14 +344,8 @@ def test_a_damaged_configuration_is_a_problem_that_is_told(session: Path, tmp_pa
     reader = SessionReader(session)
     configs = dict(reader.configs)
     configs["N1"] = configs["N1"][:-1] + b"\0"
-    with SessionWriter(
-        path,
-        ini_text=reader.ini_text,
-        configs=configs,
-        metadata={"verified": "true"},
-        pmus=reader.pmus,
-        instances=reader.instances,
-    ) as log:
+    head = Head(reader.ini_text, reader.pmus, reader.instances, metadata={"verified": "true"})
+    with SessionWriter(path, head, configs) as log:
         for tick in list(reader.ticks())[:30]:
             log.tick(tick.record, tick.frames, tick.orders)
     code, _, err = told(capsys, str(path))

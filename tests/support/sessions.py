@@ -22,7 +22,8 @@ from dcon.core.values import (
     SystemState,
 )
 from dcon.session.codec import Timing
-from dcon.session.log import SessionWriter
+from dcon.session.head import Head
+from dcon.session.writer import SessionWriter
 from pmutools.flow import StampSource
 from pmutools.schema.pmu_log import PmuFrame
 
@@ -32,6 +33,7 @@ FLAGS = ("stat", "timestamp_step", "arrival_gap")
 INI = "[controller]\ngain_mw_per_mhz = 9   ; Δf\n"
 CONFIGS = {name: b"\xaa\x31\x00\x10 cfg " + name.encode() for name in PMUS}
 METADATA = {"seed": "7", "plant": "modal", "scenario": "cjb"}
+HEAD = Head(INI, PMUS, INSTANCES, FLAGS, METADATA)
 T0 = 1_473_354_311_000_000_000
 PERIOD_NS = 16_666_667
 
@@ -70,9 +72,7 @@ def write_tick(session: SessionWriter, tick: Tick) -> None:
 
 
 def open_session(path: Path) -> SessionWriter:
-    return SessionWriter(
-        path, ini_text=INI, configs=CONFIGS, metadata=METADATA, pmus=PMUS, instances=INSTANCES, flags=FLAGS
-    )
+    return SessionWriter(path, HEAD, CONFIGS)
 
 
 def bits(value: object) -> object:
