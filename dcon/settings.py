@@ -54,6 +54,11 @@ class Output:
 class Platform:
     """``[platform]``: the 60 Hz loop."""
 
+    run_dir: Path | None = field(default=None, metadata=parsed_by(Path))
+    """Folder of the sockets by which control process, watchdog, server and output meet; mode 0700, so that nobody else
+    may enter. ``--run-dir`` goes over it; without one ``dcon platform`` is alone and ``dcon run`` takes a temporary
+    one."""
+
     phase_ms: float = field(default=4.0, metadata=parsed_by(number(0, 1000)))
     """Ticks are this long after each 1/60 s of UTC."""
     fifo: bool = field(default=True, metadata=parsed_by(boolean))

@@ -13,6 +13,7 @@ COMMANDS = {
     "export": ("dcon.cli.export", "A session log as a table."),
     "analyze": ("dcon.cli.analyze", "What recorded sessions tell: a report, figures, and JSON."),
     "check": ("dcon.cli.check", "Dry check of an initialisation file; prints every effective setting."),
+    "run": ("dcon.cli.run", "Controller, watchdog, server and output, started and looked after."),
     "platform": ("dcon.cli.platform", "The real-time controller: PMU streams in, command out, session log."),
 }
 

@@ -2,38 +2,39 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from types import FrameType
 
 from pmutools import linux
 
-LOG = logging.getLogger(__name__)
 PATIENCE_S = 3.0
 
 
 def launch(
-    arguments: Sequence[str], *, dies_by: signal.Signals = signal.SIGKILL, pass_fds: Sequence[int] = (), **given: object
+    arguments: Sequence[str],
+    *,
+    dies_by: signal.Signals = signal.SIGKILL,
+    pass_fds: Sequence[int] = (),
+    stdout: int | None = None,
+    env: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[str]:
     """``python ARGUMENTS`` in a process group of its own: Ctrl-C at the terminal is for its parent to pass on.
 
     It gets ``dies_by`` should this process end before it.
     """
-
-    def bind() -> None:
-        linux.end_with_parent(dies_by)
-
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdin=subprocess.DEVNULL,
+        stdout=stdout,
         text=True,
+        env=env,
         pass_fds=pass_fds,
         process_group=0,
-        preexec_fn=bind,  # single-threaded still: nothing holds a lock between fork and exec
-        **given,  # type: ignore[call-overload]
+        preexec_fn=partial(linux.end_with_parent, dies_by),  # one thread, still: nobody holds a lock at the fork
     )
 
 

@@ -1,0 +1,157 @@
+"""What passes between the watchdog and everybody else, but for the command: beats, readbacks, words, its status.
+
+Big-endian, CRC-32 (zlib) of all before it at the end::
+
+    DCB1 beat      32 bytes  4s magic | 8s loop | I counter | q monotonic_ns | B state | 3x
+    DCR1 readback  28 bytes  4s magic | I sequence answered | q monotonic_ns | d V
+    DCO1 word      44 bytes  4s magic | B verb | 3x | 32s who
+    DCW1 status    28 bytes  4s magic | I counter | q monotonic_ns | B relays | B estop | B state | B healthy | I causes
+
+The watchdog has a codec of its own for the same datagrams, and the tests hold the two together.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from enum import IntEnum, StrEnum
+from typing import Final, NamedTuple
+
+
+class LoopName(StrEnum):
+    """Who beats."""
+
+    CONTROL = "control"
+    UDP = "udp"
+    PARSE = "parse"
+    GPS = "gps"
+    GUI = "gui"
+    PDCI = "pdci"
+    SERVER = "server"
+    OUTPUT = "output"
+
+
+class LoopState(IntEnum):
+    """What a loop says of itself."""
+
+    STARTING = 0
+    RUNNING = 1
+    ENDING = 2
+    FAILED = 3
+
+
+class Verb(IntEnum):
+    """What an operator says to the watchdog."""
+
+    ESTOP = 1
+    ESTOP_RELEASE = 2
+    RESET = 3
+
+
+class WatchdogState(IntEnum):
+    """OPEN and TRIPPED: the relays are open; TRIPPED is left by a reset only."""
+
+    OPEN = 0
+    CLOSED = 1
+    TRIPPED = 2
+
+
+CAUSES: Final = (
+    *LoopName,
+    *("command_silent", "malformed", "range", "mismatch", "sequence", "stamp", "unasked"),
+    *("readback_silent", "readback", "estop_software", "estop_a", "estop_b", "estop_discrepancy"),
+    *("relay_open", "relay_welded", "drive", "late"),
+)
+"""Names of the bits of ``causes``, lowest first."""
+WHO_BYTES: Final = 32
+
+
+class Readback(NamedTuple):
+    """What the output drives, in answer to the command of that ``sequence``."""
+
+    sequence: int
+    monotonic_ns: int
+    volts: float
+
+
+class WatchdogStatus(NamedTuple):
+    """What the watchdog tells each 20 ms, and when something changes."""
+
+    counter: int
+    monotonic_ns: int
+    relay_a: bool
+    """Closed."""
+    relay_b: bool
+    estop_software: bool
+    """Released."""
+    estop_a: bool
+    estop_b: bool
+    state: WatchdogState
+    healthy: bool
+    """Every beat and input is good: the relays would close if they were asked to, or may stay closed."""
+    causes: tuple[str, ...]
+    """What is up, or was latched by a trip; ``server`` only warns."""
+
+    @property
+    def closed(self) -> bool:
+        """The command passes."""
+        return self.relay_a and self.relay_b
+
+    @property
+    def estop_released(self) -> bool:
+        """By everybody who can press it."""
+        return self.estop_software and self.estop_a and self.estop_b
+
+
+def _with_crc(layout: str, *values: object) -> bytes:
+    body = struct.pack(">" + layout, *values)
+    return body + zlib.crc32(body).to_bytes(4, "big")
+
+
+def _without_crc(datagram: bytes, magic: bytes, layout: str) -> tuple[int, ...] | None:
+    """What follows the magic, as ``layout`` lays it out; None for another datagram or one that is damaged."""
+    body, crc = datagram[:-4], datagram[-4:]
+    if not datagram.startswith(magic) or len(body) != 4 + struct.calcsize(">" + layout):
+        return None
+    if zlib.crc32(body).to_bytes(4, "big") != crc:
+        return None
+    return struct.unpack_from(">" + layout, body, 4)
+
+
+def encode_beat(loop: LoopName, counter: int, monotonic_ns: int, state: LoopState = LoopState.RUNNING) -> bytes:
+    """A sign of life; ``counter`` advances with each round of the loop, and wraps at 2**32."""
+    return _with_crc("4s8sIqB3x", b"DCB1", loop.encode(), counter & 0xFFFFFFFF, monotonic_ns, state)
+
+
+def encode_readback(readback: Readback) -> bytes:
+    """To the watchdog, and to the controller."""
+    return _with_crc("4sIqd", b"DCR1", readback.sequence & 0xFFFFFFFF, readback.monotonic_ns, readback.volts)
+
+
+def decode_readback(datagram: bytes) -> Readback | None:
+    """None for anything else."""
+    values = _without_crc(datagram, b"DCR1", "Iqd")
+    return None if values is None else Readback(*values)
+
+
+def encode_word(verb: Verb, who: str) -> bytes:
+    """An operator's word; of a longer name as many whole characters as find room in 32 bytes."""
+    name = who.encode()[:WHO_BYTES].decode(errors="ignore").encode()
+    return _with_crc("4sB3x32s", b"DCO1", verb, name)
+
+
+def decode_status(datagram: bytes) -> WatchdogStatus | None:
+    """None for anything else, and for a state that there is not."""
+    values = _without_crc(datagram, b"DCW1", "IqBBBBI")
+    if values is None or values[4] not in tuple(WatchdogState):
+        return None
+    counter, monotonic_ns, relays, estop, state, healthy, causes = values
+    return WatchdogStatus(
+        counter,
+        monotonic_ns,
+        *(bool(relays >> bit & 1) for bit in range(2)),
+        *(bool(estop >> bit & 1) for bit in range(3)),
+        WatchdogState(state),
+        bool(healthy),
+        tuple(name for bit, name in enumerate(CAUSES) if causes >> bit & 1),
+    )
