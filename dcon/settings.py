@@ -14,11 +14,11 @@ from dcon.core.params import Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
+from dcon.places import Destination, LineSource, destination, line_source
 from pmutools.errors import SettingsError
-from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
-from pmutools.sites import Site, endpoint, read_ini, sites_of
+from pmutools.sites import Site, read_ini, sites_of
 
 PARAMS = {item.name: item for item in fields(Params)}
 ELSEWHERE = frozenset(("pmus", "instances", "rate_hz", "thresholds", "line", "required", "probing"))
@@ -30,24 +30,28 @@ RATE_HZ = 60
 """Of a PMU whose section names none."""
 PROBE_BYTES = 16 << 20
 """Largest file of a probing signal."""
-_SEPARATORS = " ,()"
-"""In lists of instances."""
+TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
 T = TypeVar("T")
-
-
-def _destination(text: str) -> Endpoint:
-    where = endpoint(text)
-    if where.scheme is not Scheme.UDP or not where.port:
-        raise ValueError(f"{text}: commands leave as udp://HOST:PORT")
-    return where
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
     """``[output]``: where the command goes."""
 
-    url: Endpoint | None = field(default=None, metadata=parsed_by(_destination))
-    """``udp://HOST:PORT`` of the plant or gateway; nothing is sent without it."""
+    url: Destination | None = field(default=None, metadata=parsed_by(destination))
+    """``udp://HOST:PORT`` of a plant or gateway, ``iio://FOLDER?...`` or ``modbus://HOST:PORT?...`` (see the page on
+    outputs); nothing is driven without it."""
+    hold_ms: float = field(default=100.0, metadata=parsed_by(number(20, 1000)))
+    """``iio://`` and ``modbus://``: the output goes to 0 V by itself when no command has come for so long."""
+
+
+@dataclass(frozen=True, slots=True)
+class LineInput:
+    """``[pdci]``: where the line's status comes from. What it is judged by is :class:`~dcon.core.params.Line`."""
+
+    url: LineSource | None = field(default=None, metadata=parsed_by(line_source))
+    """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device that is
+    asked (see the page on outputs); without it the status is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +72,12 @@ class Platform:
     pauses now and then, and the loop makes up for it; a real-time system must not pause."""
     gps_required: bool = field(default=False, metadata=parsed_by(boolean))
     """The GPS lock of the controller's clock must be known: without it no arming, and a loss disarms."""
+    time_source: str = field(default="auto", metadata=parsed_by(choice(*TIME_SOURCES)))
+    """Whose word on this machine's clock counts as its GPS lock: ``kernel`` (adjtimex), ``chrony``, ``gpsd``, ``ptp``,
+    the best promise among them (``auto``: the lock is not known until somebody promises something), or nobody's
+    (``none``: it is not known)."""
+    time_bound_ms: float = field(default=5.0, metadata=parsed_by(number(1e-3, 1000)))
+    """The clock has its lock while that word is that it is no further than this from UTC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +123,7 @@ class Settings:
     """The file itself, for the log."""
     probe_file: bytes = b""
     """What ``file`` of ``[probing]`` names, for the log."""
+    line_input: LineInput = LineInput()
 
 
 def load(path: str | Path) -> Settings:
@@ -160,6 +171,7 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
         fill(Log, ini.section("log")),
         text,
         probe_file,
+        line_input=fill(LineInput, _split(ini.section("pdci"), LineInput)[0]),
     )
 
 
@@ -220,8 +232,8 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
     priority = entries.pop("priority", None)
     given = _numbers(Params, Section(section.name, section.where, entries), skip=ELSEWHERE)
     thresholds = _filled(Thresholds, ini.section("supervisor"))
-    line = _filled(Line, ini.section("pdci"))
-    instances = every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
+    line = _filled(Line, _split(ini.section("pdci"), LineInput)[1])
+    instances = _every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
         entry = entries.get("gain_mw_per_mhz") or entries["gain_max_mw_per_mhz"]
@@ -241,6 +253,14 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
         raise
     except SettingsError as error:
         raise section.where.error(error) from None
+
+
+def _split(section: Section, cls: type) -> tuple[Section, Section]:
+    """A section that two classes share: the entries of ``cls``, and the others."""
+    names = {item.name for item in fields(cls)}
+    mine = {key: entry for key, entry in section.entries.items() if key in names}
+    others = {key: entry for key, entry in section.entries.items() if key not in names}
+    return Section(section.name, section.where, mine), Section(section.name, section.where, others)
 
 
 def _filled(cls: type[T], section: Section) -> T:
@@ -315,3 +335,35 @@ def _priority(sites: tuple[Site, ...], priority: Entry) -> tuple[Pair, ...]:
     if not pairs:
         raise priority.where.error("lists no pair; write NORTH-SOUTH,NORTH-SOUTH,... or leave the key out")
     return tuple(pairs)
+
+
+def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
+    """Every setting in force but those of single PMUs, for ``dcon check``: section, key, value with unit, source."""
+    rows = []
+    params = settings.params
+    sections: tuple[tuple[str, Any], ...] = (
+        ("controller", params),
+        ("supervisor", params.thresholds),
+        ("probing", params.probing),
+        ("pdci", settings.line_input),
+        ("pdci", params.line),
+        ("platform", settings.platform),
+        ("watchdog", settings.watchdog),
+        ("server", settings.server),
+        ("output", settings.output),
+        ("log", settings.log),
+    )
+    for section, values in sections:
+        left_out = {"controller": ELSEWHERE, "probing": ("samples",)}.get(section, ())
+        for item in fields(values):
+            if item.name not in left_out:
+                value = _shown(getattr(values, item.name), item.metadata.get("unit", ""))
+                rows.append((section, item.name, value, item.metadata.get("source", "")))
+        if section == "controller":
+            rows.append((section, "priority", ",".join(params.instance_names), ""))
+    return rows
+
+
+def _shown(value: object, unit: str) -> str:
+    text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
+    return f"{text.lower() if isinstance(value, bool) else text} {unit}".strip()

@@ -1,0 +1,45 @@
+"""``dcon output``."""
+
+from __future__ import annotations
+
+import signal
+
+import click
+
+from pmutools.cli.shell import Exit, Talk, common
+
+
+@click.command(name="output", short_help="The output process: commands from the watchdog to a DAC or a Modbus device.")
+@click.option("--ini", required=True, metavar="FILE")
+@click.option("--run-dir", required=True, metavar="DIR", help="Where the platform's processes meet.")
+@common
+def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) -> int:
+    """Drive what [output] names, iio:// or modbus://, with the commands that the watchdog lets through.
+
+    Without a command for [output] hold_ms it goes to 0 V by itself. Ctrl-C leaves 0 V. Killed with SIGKILL it leaves
+    the last value: then only the relays take it off the line.
+    """
+    from dcon.link.paths import prepare
+    from dcon.platform.output import OutputProcess
+    from dcon.settings import load
+
+    talk = Talk(quiet, verbose)
+    settings = load(ini)
+    process = OutputProcess(settings.output, prepare(run_dir))
+    before = {number: signal.signal(number, lambda *_: process.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
+    talk.say(f"driving {settings.output.url}; Ctrl-C ends")
+    try:
+        process.run()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    outlet, driver = process.outlet, process.driver
+    refused = ", ".join(f"{count} {why}" for why, count in sorted(outlet.refused.items()) if count)
+    said = f"{outlet.commands} commands, {process.readbacks} read back, {outlet.holds} times to 0 V for want of one"
+    talk.say(
+        said + (f"; refused: {refused}" if refused else "") + (f"; {driver.failed} failures" if driver.failed else "")
+    )
+    if driver.trouble:
+        talk.complain(f"the output may not be at 0 V: {driver.trouble}")
+        return Exit.FAILED
+    return Exit.DONE
