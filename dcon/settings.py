@@ -16,6 +16,7 @@ from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
 from dcon.places import Destination, LineSource, destination, line_source
 from pmutools.errors import SettingsError
+from pmutools.net.endpoint import Endpoint
 from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
 from pmutools.sites import Site, read_ini, sites_of
@@ -43,6 +44,11 @@ class Output:
     outputs); nothing is driven without it."""
     hold_ms: float = field(default=100.0, metadata=parsed_by(number(20, 1000)))
     """``iio://`` and ``modbus://``: the output goes to 0 V by itself when no command has come for so long."""
+
+    @property
+    def needs_process(self) -> bool:
+        """Whether ``dcon output`` drives it; the watchdog sends datagrams itself."""
+        return self.url is not None and not isinstance(self.url, Endpoint)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,10 +28,10 @@ LAYERS = [
     # the controller
     ["dcon", "dcon.limiter"],
     ["dcon.core", "dcon.places"],
+    ["dcon.link"],
     ["dcon.supervisor", "dcon.watchdog"],
     ["dcon.settings", "dcon.frontend"],
     ["dcon.engine"],
-    ["dcon.link"],
     ["dcon.session"],
     ["dcon.drivers"],
     ["dcon.sim", "dcon.platform"],

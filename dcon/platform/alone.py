@@ -8,8 +8,8 @@ from dcon.drivers.udp_command import UdpCommandDriver
 from dcon.link.crossing import Item
 from dcon.platform.ports import Ends, Nowhere
 from dcon.platform.receiving import Reception
-from dcon.session.rolling import RollingWriter
 from dcon.session.head import Head
+from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.clock import Clock
 from pmutools.net.receiver import Receivers

@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import socket
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
+from dcon.link.beats import LoopName
 from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, encode
 from dcon.link.paths import WATCHDOG, Sender
-from dcon.platform.beating import Beater
+from dcon.platform.pulse import Pulse
 from dcon.platform.receiving import Reception
 from dcon.settings import load
 from pmutools.clock import Clock, SystemClock
@@ -26,6 +26,7 @@ from pmutools.realtime import go_realtime
 
 ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
+BEAT_NS = 10_000_000
 KEPT = 1000
 """Configurations and news that may wait for room in the pair; the oldest go first."""
 COUNTS_NS = 500_000_000
@@ -70,9 +71,10 @@ class Outlet:
 class Front:
     """Both loops, in turn, until nobody takes what they find."""
 
-    def __init__(self, reception: Reception, outlet: Outlet, beat: Callable[[str], object], clock: Clock) -> None:
-        """``beat`` takes the name of a loop that has done a turn."""
-        self.reception, self.outlet, self._beat, self._clock = reception, outlet, beat, clock
+    def __init__(self, reception: Reception, outlet: Outlet, udp: Pulse, parse: Pulse, clock: Clock) -> None:
+        """``udp`` and ``parse`` are the loops' pulses."""
+        self.reception, self.outlet, self._clock = reception, outlet, clock
+        self._udp, self._parse = udp, parse
         self._counted_ns = 0
 
     def run(self) -> None:
@@ -82,14 +84,14 @@ class Front:
     def turn(self) -> None:
         reception, outlet = self.reception, self.outlet
         received = reception.receive(ROUND_NS)
-        self._beat("udp")
+        self._udp.beat(self._clock.monotonic_ns())
         reception.parse(received, outlet.add)
         now_ns = self._clock.monotonic_ns()
         if now_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns = now_ns
             outlet.add(Counts(**vars(reception.counts)))  # it also finds out whether anybody is there
         outlet.flush()
-        self._beat("parse")
+        self._parse.beat(now_ns)
 
 
 def main(arguments: list[str]) -> int:
@@ -111,9 +113,10 @@ def main(arguments: list[str]) -> int:
         return 1
     reception = Reception(receivers, counts)
     try:
-        beater = Beater(Sender(given.run_dir / WATCHDOG), clock)
+        sender = Sender(given.run_dir / WATCHDOG)
+        udp, parse = (Pulse(name, sender, BEAT_NS) for name in (LoopName.UDP, LoopName.PARSE))
         go_realtime(fifo=settings.platform.fifo, priority=PRIORITY)
-        Front(reception, outlet, beater.beat, clock).run()
+        Front(reception, outlet, udp, parse, clock).run()
     finally:
         reception.close()
     return 0

@@ -43,7 +43,8 @@ class Member(NamedTuple):
     """One process: when it may be called ready, and how long it may take to end."""
 
     name: str
-    socket: str
+    inbox: str
+    """Its socket in the run folder."""
     kind: int = socket.SOCK_DGRAM
     patience_s: float = 5.0
 
@@ -77,7 +78,7 @@ class _Running:
     started_s: float = 0.0
     again_s: float = 0.0
     """When to start it again, where it does not run."""
-    backoff: Backoff = Backoff()
+    backoff: Backoff = field(default_factory=Backoff)
 
 
 class Household:
@@ -167,7 +168,7 @@ class Household:
         """Wait until it has its socket; false where the end was asked for meanwhile."""
         assert each.process is not None
         end_s = time.monotonic() + START_S
-        path = self.folder / each.member.socket
+        path = self.folder / each.member.inbox
         while not paths.is_held(path, each.member.kind):
             if self.stopping:
                 return False

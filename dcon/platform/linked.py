@@ -1,4 +1,4 @@
-"""The control loop's ends where it is one process of several: the front's socket pair and the sockets of the run folder.
+"""The control loop's ends where it is one process of several: the front's pair, and the sockets of the run folder.
 
 Every call returns at once; what is not taken is counted.
 """
@@ -17,14 +17,15 @@ from dcon.drivers.udp_command import CommandOut, encode
 from dcon.frontend import Reading
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
+from dcon.link.beats import LoopName
 from dcon.link.crossing import Counts, Failure, Item, decode
 from dcon.link.paths import Sender
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
-from dcon.platform.beating import Beater
 from dcon.platform.children import Children
-from dcon.platform.news import Heard, hear, is_old, surroundings
+from dcon.platform.news import Heard, hear, is_healthy, surroundings
 from dcon.platform.ports import Ends, Told
+from dcon.platform.pulse import Pulse
 from dcon.session.codec import Timing
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
@@ -45,6 +46,8 @@ LAST_S = 5.0
 HEALTHY_S = 10.0
 """How long, at the start, the watchdog is waited for."""
 ROUND_NS = 16_666_667
+BEAT_NS = 10_000_000
+"""A tick is longer: each beats, but for those that are made up for."""
 NEWS_BYTES = 1 << 16
 
 
@@ -91,8 +94,9 @@ class PairFrames:
 class WatchdogCommand:
     """The command, and with it the control loop's sign of life, to the watchdog."""
 
-    def __init__(self, sender: Sender, beater: Beater, clock: Clock) -> None:
-        self._sender, self._beater, self._clock = sender, beater, clock
+    def __init__(self, sender: Sender, clock: Clock) -> None:
+        self._sender, self._clock = sender, clock
+        self._pulse = Pulse(LoopName.CONTROL, sender, BEAT_NS)
         self._sequence = 0
         self.failed = 0
         self.sent_ns = 0
@@ -103,7 +107,7 @@ class WatchdogCommand:
         datagram = encode(CommandOut(self._sequence, time_ns, output_v * MW_PER_V, output_v, flags))
         self._sequence += 1
         self.failed += not self._sender.send(datagram)
-        self._beater.beat("control")
+        self._pulse.beat(self.sent_ns)
 
     def close(self) -> None:
         self._sender.close()
@@ -192,8 +196,7 @@ class Linked:
         """Raises SourceError where another control process lives in the folder."""
         self._clock = clock
         inbox = paths.bind_datagram(folder, paths.CONTROL)
-        self._sender = Sender(folder / paths.WATCHDOG)
-        command = self._command = WatchdogCommand(self._sender, Beater(self._sender, clock), clock)
+        command = self._command = WatchdogCommand(Sender(folder / paths.WATCHDOG), clock)
         self._children = Children()
         ours, theirs = pair()
         self._frames = PairFrames(ours, clock)
@@ -227,7 +230,7 @@ class Linked:
             if trouble := self._children.trouble():
                 self._frames.keep()  # its last words
                 raise SourceError(trouble)
-            if self._news.heard.healthy and not is_old(self._news.heard, now_ns):
+            if is_healthy(self._news.heard, now_ns):
                 return
             if now_ns >= end_ns:
                 LOG.warning("the watchdog is not healthy after %g s; it says why", HEALTHY_S)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 from dcon.core.rows import CORE
 from dcon.core.system import ENGAGED, Trigger
-from dcon.core.values import NOTHING, Order, SystemState
+from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
 from dcon.link.crossing import Failure, Item, PmuFrameIn
 from dcon.platform.orders import OrderBook, TimedOrder

@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from dcon.core.values import NOTHING, Order, Pdci, Surroundings
-from dcon.link import beats
+from dcon.core.values import Order, Pdci, Surroundings
+from dcon.link.beats import Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
 
 STATUS_NS = 100_000_000
 """A watchdog that has said nothing for so long is not healthy."""
@@ -19,8 +19,15 @@ GPS_NS = 3_000_000_000
 """A lock that nobody has spoken of for so long is getting old."""
 SERVER_NS = 3_000_000_000
 """What the server has found out is not told any longer once it has been silent for so long."""
-RELEASED = 0b111
-"""Emergency stop: in software, line a, line b."""
+
+
+class Server(NamedTuple):
+    """What the server says, heard at ``heard_ns``."""
+
+    heard_ns: int
+    disk_free_percent: float | None = None
+    response_gain: float | None = None
+    response_lag_ms: float | None = None
 
 
 class Heard(NamedTuple):
@@ -29,18 +36,11 @@ class Heard(NamedTuple):
     started_ns: int
     gps_age_s: float | None = None
     gps_ns: int = 0
-    healthy: bool = False
-    estop_released: bool | None = None
-    status_ns: int | None = None
-    """Stamp of the watchdog's status, by its own clock: the same one."""
+    status: WatchdogStatus | None = None
+    """Stamped by its sender's CLOCK_MONOTONIC, which is this process's too; so is ``readback``."""
+    readback: Readback | None = None
     pdci: Pdci | None = None
-    readback_v: float | None = None
-    readback_ns: int = 0
-    """Stamp of the readback, likewise."""
-    server_ns: int | None = None
-    disk_free_percent: float | None = None
-    response_gain: float | None = None
-    response_lag_ms: float | None = None
+    server: Server | None = None
     ignored: int = 0
     """Datagrams that say nothing which is known here."""
 
@@ -55,11 +55,10 @@ class Said(NamedTuple):
 def hear(heard: Heard, datagram: bytes, now_ns: int) -> Said:
     """What is known after a datagram that was taken at ``now_ns`` (monotonic). Never raises: what makes no sense is
     counted."""
-    if (status := beats.decode_status(datagram)) is not None:
-        released = status.estop & RELEASED == RELEASED
-        return Said(heard._replace(healthy=status.healthy, estop_released=released, status_ns=status.monotonic_ns))
-    if (readback := beats.decode_readback(datagram)) is not None:
-        return Said(heard._replace(readback_v=readback.volts, readback_ns=readback.monotonic_ns))
+    if (status := decode_status(datagram)) is not None:
+        return Said(heard._replace(status=status))
+    if (readback := decode_readback(datagram)) is not None:
+        return Said(heard._replace(readback=readback))
     try:
         said = json.loads(datagram)
         return _KINDS[said["kind"]](heard, said, now_ns)
@@ -91,12 +90,10 @@ def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
 
 
 def _server(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
-    disk, gain, lag = (said.get(key) for key in ("disk_free_percent", "response_gain", "response_lag_ms"))
-    numbers = (None if value is None else _number(value) for value in (disk, gain, lag))
-    return Said(heard._replace(server_ns=now_ns)._replace(**dict(zip(_FOUND, numbers, strict=True))))
+    found = [said.get(key) for key in Server._fields[1:]]
+    return Said(heard._replace(server=Server(now_ns, *(None if value is None else _number(value) for value in found))))
 
 
-_FOUND = ("disk_free_percent", "response_gain", "response_lag_ms")
 _KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server}
 
 
@@ -111,23 +108,30 @@ def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
 
     A readback counts only where it was taken after that: an older one answers an older command.
     """
-    server_ns = heard.started_ns if heard.server_ns is None else heard.server_ns
-    told = NOTHING._replace(
+    readback, status = heard.readback, heard.status
+    server = heard.server or Server(heard.started_ns)
+    silent_ns = max(now_ns - server.heard_ns, 0)
+    if silent_ns > SERVER_NS:
+        server = Server(server.heard_ns)
+    return Surroundings(
         gps_age_s=_gps_age_s(heard, now_ns),
-        watchdog_healthy=heard.healthy and not is_old(heard, now_ns),
-        estop_released=heard.estop_released,
+        watchdog_healthy=is_healthy(heard, now_ns),
+        estop_released=None if status is None else status.estop_released,
         pdci=heard.pdci,
-        readback_v=heard.readback_v if heard.readback_ns >= sent_ns else None,
-        server_age_s=max(now_ns - server_ns, 0) / 1e9,
+        readback_v=None if readback is None or readback.monotonic_ns < sent_ns else readback.volts,
+        response_gain=server.response_gain,
+        response_lag_ms=server.response_lag_ms,
+        server_age_s=silent_ns / 1e9,
+        disk_free_percent=server.disk_free_percent,
     )
-    if now_ns - server_ns > SERVER_NS:
-        return told
-    return told._replace(**{name: getattr(heard, name) for name in _FOUND})
 
 
-def is_old(heard: Heard, now_ns: int) -> bool:
-    """Whether the watchdog has said nothing for too long."""
-    return heard.status_ns is None or now_ns - heard.status_ns > STATUS_NS
+def is_healthy(heard: Heard, now_ns: int) -> bool:
+    """Whether the watchdog lives, has not tripped, and would close its relays."""
+    status = heard.status
+    if status is None or now_ns - status.monotonic_ns > STATUS_NS:
+        return False
+    return status.healthy and status.state is not WatchdogState.TRIPPED
 
 
 def _gps_age_s(heard: Heard, now_ns: int) -> float | None:

@@ -11,8 +11,6 @@ import logging
 import math
 import select
 import socket
-import struct
-import zlib
 from pathlib import Path
 
 from dcon.drivers.driver import Driver
@@ -20,9 +18,10 @@ from dcon.drivers.iio import IioDriver
 from dcon.drivers.modbus_output import ModbusDriver
 from dcon.drivers.outlet import Drive, Outlet
 from dcon.link import paths
+from dcon.link.beats import LoopName, LoopState, Readback, encode_readback
 from dcon.link.paths import Sender
 from dcon.places import IioPlace, ModbusPlace
-from dcon.platform.pulse import LoopState, Pulse
+from dcon.platform.pulse import Pulse
 from dcon.settings import Output
 from pmutools.clock import Clock, SystemClock
 from pmutools.errors import SettingsError
@@ -36,14 +35,6 @@ REMEMBERED = 256
 AT_ONCE = 64
 """Datagrams taken in one turn."""
 DATAGRAM_BYTES = 64
-_READBACK = struct.Struct(">4sIqd")
-_CRC = struct.Struct(">I")
-
-
-def encode_readback(sequence: int, monotonic_ns: int, output_v: float) -> bytes:
-    """``DCR1``: the answer to the command ``sequence``."""
-    body = _READBACK.pack(b"DCR1", sequence, monotonic_ns, output_v)
-    return body + _CRC.pack(zlib.crc32(body))
 
 
 def open_driver(output: Output) -> Driver:
@@ -75,7 +66,7 @@ class OutputProcess:
             paths.release(self._inbox)
             raise
         self._watchdog, self._control = Sender(run_dir / paths.WATCHDOG), Sender(run_dir / paths.CONTROL)
-        self._pulse = Pulse("output", self._watchdog, BEAT_NS)
+        self._pulse = Pulse(LoopName.OUTPUT, self._watchdog, BEAT_NS)
         self.outlet = Outlet(round(output.hold_ms * 1e6), self._clock.monotonic_ns())
         self.readbacks = 0
         """Those that were sent."""
@@ -138,7 +129,7 @@ class OutputProcess:
             return
         self._asked = {number: asked for number, asked in self._asked.items() if number > found.number}
         if math.isfinite(found.output_v):
-            answer = encode_readback(sequence, self._clock.monotonic_ns(), found.output_v)
+            answer = encode_readback(Readback(sequence, self._clock.monotonic_ns(), found.output_v))
             self._watchdog.send(answer)
             self._control.send(answer)
             self.readbacks += 1
