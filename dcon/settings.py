@@ -14,7 +14,8 @@ from dcon.core.params import Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
-from dcon.places import Destination, LineSource, destination, line_source
+from dcon.watchdog.codec import LOOPS
+from dcon.watchdog.limits import BOUNDS, Limits, Rules
 from pmutools.errors import SettingsError
 from pmutools.net.endpoint import Endpoint
 from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
@@ -86,12 +87,92 @@ class Platform:
     """The clock has its lock while that word is that it is no further than this from UTC."""
 
 
+def _loops(text: str) -> tuple[str, ...]:
+    return tuple(map(choice(*LOOPS), words(text)))
+
+
+def _limit(name: str) -> float:
+    """A field for a limit of the watchdog, which has its own defaults and bounds."""
+    default: float = field(default=getattr(Limits(), name), metadata=parsed_by(number(*BOUNDS[name])))
+    return default
+
+
 @dataclass(frozen=True, slots=True)
 class Watchdog:
-    """``[watchdog]``."""
+    """``[watchdog]``. Files are such as GPIO value files, on a local disk."""
 
     required: bool = field(default=False, metadata=parsed_by(boolean))
     """Watchdog and emergency stop must be known to be healthy and released: without them no arming, a loss trips."""
+    beats: tuple[str, ...] = field(default=Rules().beats, metadata=parsed_by(_loops))
+    """Loops whose beats must come; others are judged from their first beat on."""
+    readback: str = field(default="auto", metadata=parsed_by(choice("auto", "required")))
+    """``required``: without a readback of the output the relays open; ``auto``: from the first readback on."""
+    status: tuple[str, ...] = field(default=("control.in", "status.in"), metadata=parsed_by(words))
+    """Sockets of the run folder that are told each 20 ms; one that nobody holds does no harm."""
+    estop_a: str = field(default="", metadata=parsed_by(str))
+    """File of line a of the emergency stop: ``1`` is released, anything else is pressed; "" is no such line."""
+    estop_b: str = field(default="", metadata=parsed_by(str))
+    """The same of line b."""
+    relay_a: str = field(default="", metadata=parsed_by(str))
+    """File that drives relay a: ``1`` closes it. It must be there; one that cannot be written trips."""
+    relay_b: str = field(default="", metadata=parsed_by(str))
+    """The same of relay b, in series with a."""
+    contact_a: str = field(default="", metadata=parsed_by(str))
+    """File that shows the contact of relay a: ``1`` closed, ``0`` open, anything else is wrong either way."""
+    contact_b: str = field(default="", metadata=parsed_by(str))
+    """The same of relay b."""
+    drive: str = field(default="level", metadata=parsed_by(choice("level", "pulse")))
+    """``pulse``: what drives a closed relay turns each 10 ms, so that a monostable lets it go when the process dies."""
+    fifo: bool = field(default=True, metadata=parsed_by(boolean))
+    """Ask for the FIFO scheduling policy, above the controller's; without the privilege it runs on, with a warning."""
+    log: str = field(default="", metadata=parsed_by(str))
+    """File for its lines (JSON); without one they go to stderr."""
+    log_mb: float = field(default=10.0, metadata=parsed_by(number(0.01, 1e4)))
+    """A log file of so many megabytes becomes ``FILE.1``, over the one before."""
+    fast_timeout_ms: float = _limit("fast_timeout_ms")
+    """Longest time without a beat of control, udp and parse, or with beats whose counter stands."""
+    slow_timeout_ms: float = _limit("slow_timeout_ms")
+    """The same of gps, gui, pdci and output."""
+    server_timeout_ms: float = _limit("server_timeout_ms")
+    """The same of the server, which is only told."""
+    control_rate_max_hz: float = _limit("control_rate_max_hz")
+    """Largest advance of the counter of control in a second; it makes 60 rounds, and may catch up."""
+    front_rate_max_hz: float = _limit("front_rate_max_hz")
+    """The same of udp and parse."""
+    slow_rate_max_hz: float = _limit("slow_rate_max_hz")
+    """The same of all others."""
+    command_timeout_ms: float = _limit("command_timeout_ms")
+    """Longest time without a command."""
+    malformed_max: float = _limit("malformed_max")
+    """So many datagrams with a wrong size, magic, CRC or value are forgiven, until none came for a second."""
+    range_max_v: float = _limit("range_max_v")
+    """Largest volts of a command, either way."""
+    mismatch_max_mw: float = _limit("mismatch_max_mw")
+    """Largest difference of a command's MW from 12.5 MW/V times its volts."""
+    stamp_max_ms: float = _limit("stamp_max_ms")
+    """Largest difference of a command's time from the watchdog's UTC, either way."""
+    unasked_max_v: float = _limit("unasked_max_v")
+    """Largest volts, either way, of a command that does not ask for closed relays."""
+    readback_max_percent: float = _limit("readback_max_percent")
+    """Largest difference of a readback from what was forwarded, in percent of 10 V."""
+    readback_count: float = _limit("readback_count")
+    """So many in a row beyond it trip."""
+    readback_timeout_ms: float = _limit("readback_timeout_ms")
+    """Longest time without a readback, where they came or are required."""
+    estop_discrepancy_ms: float = _limit("estop_discrepancy_ms")
+    """Longest time for which one line of the emergency stop may be pressed and the other not."""
+    contact_timeout_ms: float = _limit("contact_timeout_ms")
+    """Longest time that a contact may take to be as ordered."""
+    late_max_ms: float = _limit("late_max_ms")
+    """How late a round of the watchdog itself may come; they are 10 ms apart."""
+    close_max_v: float = _limit("close_max_v")
+    """Largest volts, either way, at which the relays close."""
+
+    @property
+    def rules(self) -> Rules:
+        """What the watchdog judges by."""
+        limits = Limits(*(getattr(self, name) for name in Limits._fields))
+        return Rules(limits, self.beats, self.readback == "required")
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,5 +452,7 @@ def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
 
 
 def _shown(value: object, unit: str) -> str:
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
     text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
     return f"{text.lower() if isinstance(value, bool) else text} {unit}".strip()

@@ -27,9 +27,8 @@ LAYERS = [
     ["pmutools.cli", "pmutools.stream"],
     # the controller
     ["dcon", "dcon.limiter"],
-    ["dcon.core", "dcon.places"],
-    ["dcon.link"],
-    ["dcon.supervisor", "dcon.watchdog"],
+    ["dcon.core"],
+    ["dcon.link", "dcon.supervisor", "dcon.watchdog"],
     ["dcon.settings", "dcon.frontend"],
     ["dcon.engine"],
     ["dcon.session"],

@@ -15,7 +15,7 @@ COMMANDS = {
     "check": ("dcon.cli.check", "Dry check of an initialisation file; prints every effective setting."),
     "run": ("dcon.cli.run", "Controller, watchdog, server and output, started and looked after."),
     "platform": ("dcon.cli.platform", "The real-time controller: PMU streams in, command out, session log."),
-    "output": ("dcon.cli.output", "The output process: commands from the watchdog to a DAC or a Modbus device."),
+    "watchdog": ("dcon.cli.watchdog", "Passes the command on while all is well; opens the relays when it is not."),
 }
 
 

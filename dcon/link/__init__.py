@@ -1,1 +1,1 @@
-"""What the processes of the platform say to each other: pure codecs, and the thin ends of sockets."""
+"""What the processes of the real-time platform say to each other: pure codecs, and small helpers for their sockets."""

@@ -149,8 +149,11 @@ def decode_status(datagram: bytes) -> WatchdogStatus | None:
     return WatchdogStatus(
         counter,
         monotonic_ns,
-        *(bool(relays >> bit & 1) for bit in range(2)),
-        *(bool(estop >> bit & 1) for bit in range(3)),
+        bool(relays & 1),
+        bool(relays & 2),
+        bool(estop & 1),
+        bool(estop & 2),
+        bool(estop & 4),
         WatchdogState(state),
         bool(healthy),
         tuple(name for bit, name in enumerate(CAUSES) if causes >> bit & 1),
