@@ -57,8 +57,8 @@ class LineInput:
     """``[pdci]``: where the line's status comes from. What it is judged by is :class:`~dcon.core.params.Line`."""
 
     url: LineSource | None = field(default=None, metadata=parsed_by(line_source))
-    """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device that is
-    asked (see the page on outputs); without it the status is not known."""
+    """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device that
+    is asked (see the page on outputs); without it the status is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +193,10 @@ class Log:
     """A part of so many megabytes is ended, and the next begun."""
     max_minutes: float = field(default=60.0, metadata=parsed_by(number(1, 1e6)))
     """So is one that spans so much time."""
+    backfill_s: float = field(default=120.0, metadata=parsed_by(number(1, 3600)))
+    """What the controller keeps for a server that is away: so much time,"""
+    backfill_mb: float = field(default=64.0, metadata=parsed_by(number(1, 1000)))
+    """and at most so much memory."""
 
 
 @dataclass(frozen=True)
