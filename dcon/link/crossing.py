@@ -14,7 +14,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pmutools.c37118 import Frame
 from pmutools.flow import StampSource
@@ -127,13 +127,18 @@ def decode(message: bytes) -> Iterator[Item]:
             if source >= len(_SOURCES):
                 raise ValueError(f"no stamp source {source}")
             yield PmuFrameIn(pmu, Frame(data, arrival_ns, _SOURCES[source], 0), kind == Kind.CONFIG)
-        elif kind == Kind.NEWS:
-            said = json.loads(data)
-            yield LinkEvent(LinkKind(said["kind"]), said["where"], (), said["detail"], datagrams=said["datagrams"])
-        elif kind == Kind.COUNTS:
-            said = json.loads(data)
-            yield Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})
+        elif kind in (Kind.NEWS, Kind.COUNTS):
+            try:
+                yield _said(kind, json.loads(data))
+            except (KeyError, TypeError, AttributeError, OverflowError) as error:
+                raise ValueError(f"a record that says nothing: {error}") from None
         elif kind == Kind.FAILED:
             yield Failure(data.decode(errors="replace"))
         else:
             raise ValueError(f"no record of kind {kind}")
+
+
+def _said(kind: Kind, said: dict[str, Any]) -> LinkEvent | Counts:
+    if kind == Kind.NEWS:
+        return LinkEvent(LinkKind(said["kind"]), said["where"], (), said["detail"], datagrams=said["datagrams"])
+    return Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})

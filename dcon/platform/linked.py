@@ -239,8 +239,8 @@ class Linked:
             now_ns = clock.monotonic_ns()
 
 
-def pair() -> tuple[socket.socket, socket.socket]:
+def pair(nbytes: int = PAIR_BYTES) -> tuple[socket.socket, socket.socket]:
     """(control's end, front's end): sequenced packets, with room for seconds."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    raise_sndbuf(theirs, PAIR_BYTES)
+    raise_sndbuf(theirs, nbytes)
     return ours, theirs

@@ -1,0 +1,262 @@
+"""The front over real sockets: what is asked for passes, nothing else; a flood of one port holds nobody else up."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live import free_udp_port
+from support.swing import Streams
+
+from dcon.link.beats import LoopName
+from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, decode
+from dcon.link.paths import Sender
+from dcon.platform.children import launch
+from dcon.platform.front import KEPT, ROUND_NS, Front, Outlet
+from dcon.platform.linked import PairFrames, pair
+from dcon.platform.pulse import Pulse
+from dcon.platform.receiving import Reception
+from dcon.settings import parse
+from pmutools.c37118 import Frame
+from pmutools.c37118.config import encode_config
+from pmutools.clock import SystemClock
+from pmutools.flow import StampSource
+from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.net.receiver import Receivers
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="sequenced packets and the parent's death are Linux's"),
+]
+NAMES = ("N1", "S1")
+CLOCK = SystemClock()
+SMALL_BYTES = 1 << 17
+
+
+class Rig:
+    """A front in this process, with both ends of its pair; PMU N1 from 127.0.0.1 only."""
+
+    def __init__(self, folder: Path) -> None:
+        self.ports = [free_udp_port() for _ in NAMES]
+        self.streams = Streams(NAMES)
+        urls = [f"udp://127.0.0.1:{port}?source=127.0.0.1" for port in self.ports]
+        settings = parse(self.streams.ini(urls=urls), "test.ini")
+        ours, self.theirs = pair(SMALL_BYTES)
+        self.frames = PairFrames(ours, CLOCK)
+        self.ours = ours
+        self.counts = Counts()
+        self.receivers = Receivers([site.endpoint for site in settings.sites], CLOCK)
+        sender = Sender(folder / "watchdog.in")
+        pulses = (Pulse(name, sender) for name in (LoopName.UDP, LoopName.PARSE))
+        self.front = Front(Reception(self.receivers, self.counts), Outlet(self.theirs, self.counts), *pulses, CLOCK)
+        self.sock = self.sender("127.0.0.1")
+
+    def sender(self, host: str) -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.bind((host, 0))
+        return sock
+
+    def configure(self) -> None:
+        for name, port in zip(NAMES, self.ports, strict=True):
+            self.sock.sendto(encode_config(self.streams.configs[name]), ("127.0.0.1", port))
+
+    def send(self, pmu: int, *, sock: socket.socket | None = None) -> bytes:
+        data = self.streams.data(NAMES[pmu], time.time_ns())
+        (sock or self.sock).sendto(data, ("127.0.0.1", self.ports[pmu]))
+        return data
+
+    def turn(self) -> list[Item]:
+        self.front.turn()
+        return list(self.frames.until(0))
+
+    def turns(self, until: int) -> list[PmuFrameIn]:
+        """Frames, once there are as many; a failure after some seconds."""
+        found: list[PmuFrameIn] = []
+        end_s = time.monotonic() + 5
+        while len(found) < until:
+            assert time.monotonic() < end_s, found
+            found += [item for item in self.turn() if isinstance(item, PmuFrameIn)]
+        return found
+
+    def close(self) -> None:
+        self.receivers.close()
+        self.frames.close()
+        self.theirs.close()
+        self.sock.close()
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+def test_frames_pass_with_their_pmu_and_the_kernel_s_stamp_after_their_configuration(rig: Rig) -> None:
+    rig.configure()
+    rig.turns(2)
+    before_ns = time.time_ns()
+    sent = [rig.send(1), rig.send(0)]
+    found = rig.turns(2)
+    assert sorted((item.pmu, item.frame.data) for item in found) == [(0, sent[1]), (1, sent[0])]
+    for item in found:
+        assert not item.is_config
+        assert before_ns <= (item.frame.arrival_ns or 0) <= time.time_ns()
+    rig.configure()  # nothing new: not said again
+    rig.send(0)
+    assert [item.is_config for item in rig.turns(1)] == [False]
+
+
+def test_a_wrong_source_and_a_wrong_idcode_do_not_pass_and_are_counted(rig: Rig) -> None:
+    rig.configure()
+    rig.turns(2)
+    foreign = rig.sender("127.0.0.2")
+    with foreign:
+        for _ in range(5):
+            rig.send(0, sock=foreign)
+        rig.sock.sendto(encode_config(rig.streams.configs["S1"]), ("127.0.0.1", rig.ports[0]))
+    rig.sock.sendto(rig.streams.data("S1", time.time_ns()), ("127.0.0.1", rig.ports[0]))
+    rig.send(0)
+    assert [item.pmu for item in rig.turns(1)] == [0]
+    assert rig.counts.foreign == 5 + 2
+
+
+def test_a_malformed_flood_of_one_port_delays_nobody_by_more_than_a_round(rig: Rig) -> None:
+    """10,000 datagrams wait at the port of N1 when the frame of S1 comes."""
+    rig.configure()
+    rig.turns(2)
+    rng = random.Random(1)
+    frame = rig.send(0)
+    rig.turns(1)
+    junk = [rng.randbytes(60), frame[:-3], frame[:20] + b"\0" + frame[21:]]
+    for k in range(10_000):
+        rig.sock.sendto(junk[k % 3], ("127.0.0.1", rig.ports[0]))
+    rig.send(1)
+    began_s = time.monotonic()
+    assert any(isinstance(item, PmuFrameIn) and item.pmu == 1 for item in rig.turn())  # in the very next round
+    assert time.monotonic() - began_s < 1.0
+    assert rig.counts.undecodable > 100
+
+
+def test_a_control_process_that_stands_still_is_not_waited_for_and_loses_no_configuration(rig: Rig) -> None:
+    rig.configure()
+    rig.turns(2)
+    sent = 0
+    while rig.counts.crowded < 50:
+        assert sent < 100_000
+        for _ in range(50):
+            rig.send(0)
+        sent += 50
+        rig.front.turn()
+    slim = rig.streams.slim("S1")
+    rig.sock.sendto(encode_config(slim), ("127.0.0.1", rig.ports[1]))
+    for _ in range(3):
+        rig.front.turn()
+    assert rig.front.outlet.is_open
+    found: list[Item] = []
+    for _ in range(20):
+        found += rig.frames.until(0)
+        rig.front.turn()
+    changed = [item for item in found if isinstance(item, PmuFrameIn) and item.is_config]
+    assert [item.pmu for item in changed] == [1]
+    taken = sum(isinstance(item, PmuFrameIn) and not item.is_config for item in found)
+    assert taken + rig.counts.crowded == sent
+
+
+def test_news_that_wait_are_bounded() -> None:
+    ours, theirs = pair(SMALL_BYTES)
+    with ours, theirs:
+        outlet = Outlet(theirs, Counts())
+        for number in range(5 * KEPT):
+            outlet.add(LinkEvent(LinkKind.FOREIGN, f"{number}", ()))
+            if number % 100 == 0 or number < KEPT:
+                outlet.flush()
+        outlet.flush()
+        assert len(outlet._items) == KEPT
+        assert outlet.is_open
+
+
+def test_the_end_of_the_pair_is_the_end_of_the_front(rig: Rig) -> None:
+    rig.ours.close()
+    rig.front._counted_ns = 0
+    began_s = time.monotonic()
+    rig.front.run()
+    assert time.monotonic() - began_s < 50 * ROUND_NS / 1e9
+
+
+# --- as a process --------------------------------------------------------------------------------------------------
+
+
+def start(folder: Path, ports: list[int]) -> tuple[subprocess.Popen[str], PairFrames]:
+    urls = [f"udp://127.0.0.1:{port}" for port in ports]
+    (folder / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra="\n[platform]\nfifo = no\n"))
+    ours, theirs = pair()
+    with theirs:
+        command = ["-m", "dcon.platform.front", "--ini", str(folder / "site.ini"), "--run-dir", str(folder)]
+        process = launch([*command, "--fd", str(theirs.fileno())], pass_fds=(theirs.fileno(),))
+    return process, PairFrames(ours, CLOCK)
+
+
+def test_a_port_in_use_is_told_in_one_line(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = int(taken.getsockname()[1])
+        process, frames = start(tmp_path, [port, free_udp_port()])
+        assert process.wait(20) == 1
+    (failure,) = frames.until(0)
+    frames.close()
+    assert isinstance(failure, Failure) and f"udp://127.0.0.1:{port}" in failure.reason and "\n" not in failure.reason
+
+
+def test_a_front_dies_with_its_parent_even_while_it_is_stopped(tmp_path: Path) -> None:
+    """The parent here is a process that is killed; what it leaves must be gone."""
+    script = (
+        "import sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
+        "from dcon.platform.children import launch;"
+        "p = launch(['-c', 'import time; time.sleep(60)']); print(p.pid, flush=True); time.sleep(60)"
+    )
+    root = str(Path(__file__).parents[2])
+    with subprocess.Popen([sys.executable, "-c", script, root], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        child = Path(f"/proc/{pid}/stat")
+        assert child.exists()
+        os.kill(pid, signal.SIGSTOP)
+        parent.kill()
+    end_s = time.monotonic() + 5
+    while child.exists() and child.read_text().rpartition(")")[2].split()[0] != "Z":
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_a_killed_front_is_seen_at_once(tmp_path: Path) -> None:
+    process, frames = start(tmp_path, [free_udp_port(), free_udp_port()])
+    bound: list[Item] = []
+    end_s = time.monotonic() + 20
+    while len(bound) < 2:
+        assert time.monotonic() < end_s
+        bound += frames.until(CLOCK.monotonic_ns() + ROUND_NS)
+    process.kill()
+    process.wait(5)
+    assert frames.until(0) == []
+    frames.close()
+
+
+def test_a_frame_of_a_capture_keeps_its_source() -> None:
+    """Stamps of all sources cross the pair."""
+    ours, theirs = pair()
+    with ours, theirs:
+        outlet = Outlet(theirs, Counts())
+        frames = [PmuFrameIn(3, Frame(b"x", 5, source, 0)) for source in StampSource]
+        for item in frames:
+            outlet.add(item)
+        outlet.flush()
+        assert list(decode(ours.recv(1 << 17))) == frames

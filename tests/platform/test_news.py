@@ -1,0 +1,149 @@
+"""What a tick is told, as a function of news and time: at the edges, and whatever comes."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dcon.core.values import Order, Pdci, Surroundings
+from dcon.link.beats import Readback, WatchdogState, encode_readback
+from dcon.platform.news import GPS_NS, SERVER_NS, STATUS_NS, Heard, hear, is_healthy, surroundings
+from dcon.watchdog.codec import encode_status
+
+T0 = 10**12
+MS, S = 10**6, 10**9
+
+
+def told(*news: tuple[int, bytes | dict[str, Any]], at: int, sent: int = 0) -> Surroundings:
+    return surroundings(heard(*news), at, sent)
+
+
+def heard(*news: tuple[int, bytes | dict[str, Any]]) -> Heard:
+    now = Heard(T0)
+    for at, said in news:
+        now = hear(now, said if isinstance(said, bytes) else json.dumps(said).encode(), at).heard
+    return now
+
+
+def status(at: int, *, healthy: bool = True, estop: int = 7, state: int = 0) -> bytes:
+    return encode_status(1, at, 0, estop, state, healthy, 0)
+
+
+def test_at_the_start_nothing_is_known_and_the_watchdog_is_not_healthy() -> None:
+    assert told(at=T0) == Surroundings(watchdog_healthy=False, server_age_s=0.0)
+
+
+@pytest.mark.parametrize(("after_ns", "healthy"), [(0, True), (STATUS_NS, True), (STATUS_NS + 1, False)])
+def test_a_watchdog_is_healthy_for_100_ms_after_its_word(after_ns: int, healthy: bool) -> None:
+    assert told((T0, status(T0)), at=T0 + after_ns).watchdog_healthy is healthy
+
+
+@pytest.mark.parametrize(
+    ("said", "healthy", "released"),
+    [
+        ({}, True, True),
+        ({"healthy": False}, False, True),
+        ({"state": WatchdogState.CLOSED}, True, True),
+        ({"state": WatchdogState.TRIPPED}, False, True),
+        *(({"estop": 7 & ~(1 << bit), "healthy": False}, False, False) for bit in range(3)),
+    ],
+)
+def test_what_the_watchdog_says(said: dict[str, Any], healthy: bool, released: bool) -> None:
+    now = told((T0, status(T0, **said)), at=T0 + MS)
+    assert (now.watchdog_healthy, now.estop_released) == (healthy, released)
+
+
+def test_the_newest_word_counts_and_a_pressed_stop_stays_known_when_the_watchdog_dies() -> None:
+    now = told((T0, status(T0)), (T0, status(T0 + MS, estop=0, healthy=False)), at=T0 + 3600 * S)
+    assert (now.watchdog_healthy, now.estop_released) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "age_s"), [(0, 0.5), (GPS_NS, 0.5), (GPS_NS + 1, 3.500000001), (10 * S, 10.5), (3600 * S, 3600.5)]
+)
+def test_a_lock_that_nobody_speaks_of_grows_old(after_ns: int, age_s: float) -> None:
+    now = told((T0, {"kind": "gps", "age_s": 0.5, "source": "chrony", "detail": ""}), at=T0 + after_ns)
+    assert now.gps_age_s == pytest.approx(age_s, abs=1e-9)
+
+
+@pytest.mark.parametrize(("stamp_ns", "counts"), [(-1, False), (0, True), (1, True)])
+def test_a_readback_counts_where_it_was_taken_after_the_last_command(stamp_ns: int, counts: bool) -> None:
+    answer = encode_readback(Readback(4_000_000_000, T0 + stamp_ns, -3.25))
+    assert told((T0, answer), at=T0 + MS, sent=T0).readback_v == (-3.25 if counts else None)
+
+
+def test_the_line_s_status_is_handed_on_with_its_own_time() -> None:
+    said = {"kind": "pdci", "time_ns": 7, "power_mw": -1500, "in_service": True, "dcon_enabled": False}
+    assert told((T0, {**said, "scheduled_mw": 1400.5}), at=T0).pdci == Pdci(7, -1500.0, True, False, 1400.5)
+    unknown = told((T0, {**said, "scheduled_mw": None}), at=T0).pdci
+    assert unknown is not None and math.isnan(unknown.scheduled_mw)
+    assert told((T0, {**said, "in_service": 1}), at=T0).pdci == unknown._replace(in_service=False)
+
+
+SERVER: dict[str, Any] = {"kind": "server", "disk_free_percent": 40.0, "response_gain": 0.9, "response_lag_ms": 20}
+
+
+@pytest.mark.parametrize(("after_ns", "known"), [(0, True), (SERVER_NS, True), (SERVER_NS + 1, False)])
+def test_the_server_s_findings_are_told_for_three_seconds_and_its_silence_for_ever(after_ns: int, known: bool) -> None:
+    now = told((T0, SERVER), at=T0 + after_ns)
+    assert now.server_age_s == after_ns / S
+    found = (now.disk_free_percent, now.response_gain, now.response_lag_ms)
+    assert found == ((40.0, 0.9, 20.0) if known else (None, None, None))
+
+
+def test_a_server_that_never_spoke_is_silent_since_the_start() -> None:
+    assert told(at=T0 + 5 * S).server_age_s == 5.0
+
+
+def test_an_order_is_handed_on_once_with_who_ordered_it() -> None:
+    said = {"kind": "order", "name": "gain", "value": 12.5, "text": "", "who": "ann", "why": "test"}
+    after, order = hear(Heard(T0), json.dumps(said).encode(), T0)
+    assert order == Order("gain", 12.5, "", "ann")
+    assert hear(after, status(T0), T0).order is None
+    refused = hear(after, json.dumps({"kind": "order", "name": "link_refused", "text": "bad mac"}).encode(), T0).order
+    assert refused == Order("link_refused", 0.0, "bad mac", "")
+
+
+BAD = [
+    b"",
+    b"{}",
+    b"[]",
+    b"null",
+    b'"gps"',
+    b"\xff\xfe",
+    b'{"kind":"gps"}',
+    b'{"kind":"gps","age_s":NaN}',
+    b'{"kind":"gps","age_s":true}',
+    b'{"kind":"gps","age_s":"0"}',
+    b'{"kind":"pdci","time_ns":"x","power_mw":0}',
+    b'{"kind":"order","name":5}',
+    b'{"kind":"order","name":"gain","value":"12"}',
+    b'{"kind":["gps"]}',
+    b'{"kind":"nothing"}',
+    b"[" * 100_000,
+    b"DCW1" + bytes(24),
+    status(T0)[:-1],
+    status(T0, state=9),
+]
+
+
+@pytest.mark.parametrize("datagram", BAD)
+def test_what_makes_no_sense_is_counted_and_changes_nothing(datagram: bytes) -> None:
+    before = heard((T0, status(T0)), (T0, SERVER))
+    after, order = hear(before, datagram, T0)
+    assert after == before._replace(ignored=1) and order is None
+
+
+@given(
+    st.binary(max_size=200)
+    | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode)
+)
+def test_nothing_that_comes_raises(datagram: bytes) -> None:
+    now, _ = hear(Heard(T0), datagram, T0)
+    surroundings(now, T0, 0)
+    assert not is_healthy(now, T0)
