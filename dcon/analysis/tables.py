@@ -132,10 +132,12 @@ def register_table(session: Analysis, stem: str) -> Table:
 def order_table(session: Analysis, stem: str) -> Table:
     columns = (Column("when", "UTC", words=_W), Column("order", words=_W), Column("value"), Column("what", words=_W))
     rows = [
-        _row((utc(order.tick_ns, 3), order.tick_ns), order.name, f"{order.value:g}", order.text, order.who)
-        for order in session.columns.orders[:MOST_ROWS]
+        _row((utc(o.tick_ns, 3), o.tick_ns), o.name, f"{o.value:g}", o.text, o.who, o.why)
+        for o in session.columns.orders[:MOST_ROWS]
     ]
-    return Table(f"{stem}-orders", "The operator's orders", (*columns, Column("who", words=_W)), rows)
+    return Table(
+        f"{stem}-orders", "The operator's orders", (*columns, Column("who", words=_W), Column("why", words=_W)), rows
+    )
 
 
 def event_table(session: Analysis, stem: str) -> Table:

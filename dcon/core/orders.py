@@ -8,11 +8,13 @@ from dcon.core import register
 from dcon.core.params import Params
 from dcon.core.probe import Probe, started
 from dcon.core.register import Register
-from dcon.core.system import MODE_IS_FREE, TRANSITIONS, ArmView, Trigger, mode_of, refusal, trigger_of
+from dcon.core.system import LINK_REFUSED, MODE_IS_FREE, TRANSITIONS, ArmView, Trigger, mode_of, refusal, trigger_of
 from dcon.core.values import Event, Mode, Order, SystemState
 
 SYSTEM = "system"
 """Subject of what concerns the whole controller."""
+LINK = "link"
+"""Subject of what the operators' link refuses."""
 
 
 class Ordered(NamedTuple):
@@ -41,7 +43,7 @@ def is_stop(order: Order) -> bool:
 
 def obey(params: Params, now: Ordered, order: Order, view: ArmView, events: list[Event]) -> Ordered:
     """``now`` after one order; an event says what became of it."""
-    name, value, _, who = order
+    name, value, _, who, _ = order
     if (trigger := trigger_of(name)) is not None:
         # A second stop changes nothing and is no mistake.
         why = "" if trigger is Trigger.ESTOP else refusal(params, now.system, trigger, view)
@@ -64,7 +66,7 @@ def obey(params: Params, now: Ordered, order: Order, view: ArmView, events: list
         why = after
     else:
         why = "no such order"
-    events.append(Event("refused", str(name), why))
+    events.append(Event("refused", str(name), f"{why}; {_by('order', who)}" if who else why))
     return now
 
 
@@ -99,4 +101,23 @@ def _acknowledge(_params: Params, now: Ordered, order: Order, events: list[Event
     return now._replace(flags=register.with_changes(now.flags, [register.acknowledged(flag, who) for flag in found]))
 
 
-_OTHERS = {"probe_start": _probe_start, "probe_stop": _probe_stop, "ack": _acknowledge}
+def _release(_params: Params, now: Ordered, order: Order, events: list[Event]) -> Ordered:
+    """It is the watchdog's to release its stop: here it is only told."""
+    events.append(Event(order.name, SYSTEM, _by("order", order.who)))
+    return now
+
+
+def _link_refused(_params: Params, now: Ordered, order: Order, events: list[Event]) -> Ordered:
+    """What came over the operators' link and was no order: an input, so that it is in the log, and replays."""
+    who = order.who or "nobody known"
+    events.append(Event("refused", LINK, f"{order.text}; said to be by {who}"))
+    return now
+
+
+_OTHERS = {
+    "probe_start": _probe_start,
+    "probe_stop": _probe_stop,
+    "ack": _acknowledge,
+    "release": _release,
+    LINK_REFUSED: _link_refused,
+}

@@ -57,9 +57,12 @@ MODE_IS_FREE: Final = frozenset((_S.OFF, _S.INIT, _S.STANDBY, _S.FAULT, _S.ESTOP
 ORDERS: Final = (
     *(Trigger.START, Trigger.OFF, Trigger.ARM, Trigger.ACTIVATE, Trigger.DISARM, Trigger.RESET, Trigger.ESTOP),
     *(Mode.OPEN_LOOP, Mode.CLOSED_LOOP),
-    *("gain", "probe_start", "probe_stop", "ack"),
+    *("gain", "probe_start", "probe_stop", "ack", "release"),
 )
-"""Names that :class:`~dcon.core.values.Order` may have; ``gain`` takes a value in MW/mHz, ``ack`` names a flag."""
+"""Names that an operator's :class:`~dcon.core.values.Order` may have; ``gain`` takes a value in MW/mHz, ``ack`` names a
+flag, ``release`` is of the watchdog's emergency stop."""
+LINK_REFUSED: Final = "link_refused"
+"""Name of an order that is none: something came over the operators' link and was refused, ``text`` says why."""
 
 _TRIGGER_ORDERS: Final = {str(name): name for name in ORDERS if isinstance(name, Trigger)}
 _MODE_ORDERS: Final = {str(mode): mode for mode in Mode}

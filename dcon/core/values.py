@@ -65,6 +65,8 @@ class Order(NamedTuple):
     """What the order concerns: of ``ack`` the flag, as ``NAME`` or ``NAME SUBJECT``, empty for all."""
     who: str = ""
     """Who ordered it."""
+    why: str = ""
+    """In the operator's words."""
 
 
 class Pdci(NamedTuple):

@@ -3,7 +3,7 @@
 Big-endian::
 
     4s magic "DCL1" | Q sequence | I session | q tick_ns | H entries | B kind | x
-    then each entry: B, B, I lengths of message, name, data | q log_time_ns | q publish_time_ns | the three themselves
+    then each entry: B, H, I lengths of message, name, data | q log_time_ns | q publish_time_ns | the three themselves
 
 Ticks, configurations and the end are numbered from 0 without a gap, so that the server knows what it missed. What is
 repeated whenever a server connects (the head, configurations that it may not know) is not numbered.
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 MAGIC = b"DCL1"
 _HEAD = struct.Struct(">4sQIqHBx")
-_ENTRY = struct.Struct(">BBIqq")
+_ENTRY = struct.Struct(">BHIqq")
 LARGEST = 128 << 10
 """Bytes of a bundle: what one packet of a Unix socket can surely carry. A tick that has more takes several."""
 UNNUMBERED = (1 << 64) - 1
@@ -118,7 +118,7 @@ def shares(entries: Iterable[Entry], largest: int = LARGEST) -> Iterator[tuple[E
 
 
 def size_of(entry: Entry) -> int:
-    """Bytes of an entry in a bundle; names are at most 255."""
+    """Bytes of an entry in a bundle."""
     return _ENTRY.size + len(entry.message.encode()) + len(entry.name.encode()) + len(entry.data)
 
 
@@ -137,7 +137,8 @@ def pieces(session: int, values: dict[str, Any], files: dict[str, bytes], larges
 def joined(bundles: Sequence[Bundle]) -> tuple[dict[str, Any], dict[str, bytes]] | None:
     """The inverse of :func:`pieces`; None until all are there, each once and in order, or where they make no sense."""
     entries = [entry for bundle in bundles for entry in bundle.entries]
-    if not entries or [entry.log_time_ns for entry in entries] != list(range(entries[0].publish_time_ns)):
+    count = len(entries)
+    if not count or any((e.log_time_ns, e.publish_time_ns) != (at, count) for at, e in enumerate(entries)):
         return None
     blobs: dict[str, list[bytes]] = {}
     for entry in entries:

@@ -125,7 +125,7 @@ def encode_order(tick_ns: int, order: Order) -> bytes:
 
 
 def decode_order(message: Any) -> Order:
-    return Order(message.name, message.value, message.text, message.who)
+    return Order(message.name, message.value, message.text, message.who, message.why)
 
 
 def encode_flag(tick_ns: int, flag: Flag) -> bytes:

@@ -104,6 +104,7 @@ class OrderRow(NamedTuple):
     value: float
     text: str
     who: str
+    why: str = ""
 
 
 class FlagRow(NamedTuple):

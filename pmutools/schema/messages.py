@@ -111,6 +111,7 @@ MESSAGES: dict[str, MessageType] = {
             Field("value", "double", "Its value; 0 where it takes none."),
             Field("text", "string", "What it concerns: of ack the flag; empty where it takes none."),
             Field("who", "string", "Who ordered it; empty where unknown."),
+            Field("why", "string", "Why, in the operator's words; empty where unknown."),
         ),
     ),
     "Watchdog": MessageType(

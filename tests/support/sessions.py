@@ -114,7 +114,13 @@ def _tick(rng: random.Random, tick_ns: int) -> Tick:
         record,
         tuple(_frame(rng, rng.choice(PMUS), tick_ns) for _ in range(rng.randint(0, 6))),
         tuple(
-            Order(rng.choice(("arm", "gain")), _float(rng), rng.choice(("", "frozen N1")), rng.choice(("", "Δ")))
+            Order(
+                rng.choice(("arm", "gain")),
+                _float(rng),
+                rng.choice(("", "frozen N1")),
+                rng.choice(("", "Δ")),
+                rng.choice(("", "τ")),
+            )
             for _ in range(rng.choice((0, 0, 1, 2)))
         ),
         rng.choice((None, Timing(_float(rng), _float(rng)))),
