@@ -114,7 +114,7 @@ def trigger_of(limits: Limits, memory: Memory, found: tuple[Finding, ...]) -> Tr
         return Trigger.LATCH
     if causes_of(found, Action.TRIP):
         return Trigger.TRIP
-    if any(word.verb == "reset" for word in memory.words):
+    if memory.state is State.TRIPPED and any(word.verb == "reset" for word in memory.words):
         return Trigger.RESET
     if not asks(memory):
         return Trigger.OPEN

@@ -56,9 +56,10 @@ class Loop(NamedTuple):
     advanced_ns: int
     """When the counter last changed."""
     state: int
-    mark_counter: int
-    """At ``mark_ns``, where the window began that its advance is counted in."""
     mark_ns: int
+    """Where the window began that its advance is counted in."""
+    moved: int = 0
+    """Advance in this window."""
     per_s: float = 0.0
     """Advance in the window before."""
 
@@ -126,14 +127,14 @@ class Memory(NamedTuple):
 def beaten(last: Loop | None, beat: Beat, now_ns: int) -> Loop:
     """A loop after a beat. A counter that goes back counts as one that has gone nearly all the way round."""
     if last is None:
-        return Loop(beat.counter, now_ns, now_ns, beat.state, beat.counter, now_ns)
-    advanced_ns = last.advanced_ns if beat.counter == last.counter else now_ns
-    new = last._replace(counter=beat.counter, heard_ns=now_ns, advanced_ns=advanced_ns, state=beat.state)
+        return Loop(beat.counter, now_ns, now_ns, beat.state, now_ns)
+    step = (beat.counter - last.counter) % WRAP
+    moved = last.moved + step
     window_ms = (now_ns - last.mark_ns) / MS
+    new = Loop(beat.counter, now_ns, now_ns if step else last.advanced_ns, beat.state, last.mark_ns, moved, last.per_s)
     if window_ms < WINDOW_MS:
         return new
-    per_s = (beat.counter - last.mark_counter) % WRAP / window_ms * 1000
-    return new._replace(mark_counter=beat.counter, mark_ns=now_ns, per_s=per_s)
+    return new._replace(mark_ns=now_ns, moved=0, per_s=moved / window_ms * 1000)
 
 
 def offended(offences: Offences, now_ns: int) -> Offences:

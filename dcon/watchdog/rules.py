@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from dcon.watchdog.codec import FAILED, LOOPS, RUNNING, WRAP
+from dcon.watchdog.codec import FAILED, LOOPS, RUNNING
 from dcon.watchdog.limits import WINDOW_MS, Rules
 from dcon.watchdog.memory import MS, Memory, Offences, State
 
@@ -69,7 +69,7 @@ def racing_hz(_rules: Rules, memory: Memory, at: int, _now_ns: int) -> float | N
     loop = memory.loops[at]
     if loop is None:
         return None
-    return max(loop.per_s, (loop.counter - loop.mark_counter) % WRAP / WINDOW_MS * 1000)
+    return max(loop.per_s, loop.moved / WINDOW_MS * 1000)
 
 
 def failed(_rules: Rules, memory: Memory, at: int, _now_ns: int) -> float | None:

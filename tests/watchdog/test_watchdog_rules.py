@@ -24,7 +24,7 @@ def loop(at: int, **changed: Any) -> Callable[[float], Memory]:
     """Memory whose loop is changed: each change is a function of the value."""
 
     def made(value: float) -> Memory:
-        old = USUAL.loops[at] or Loop(0, NOW_NS, NOW_NS, RUNNING, 0, NOW_NS)
+        old = USUAL.loops[at] or Loop(0, NOW_NS, NOW_NS, RUNNING, NOW_NS)
         new = old._replace(**{key: change(value) for key, change in changed.items()})
         return USUAL._replace(loops=(*USUAL.loops[:at], new, *USUAL.loops[at + 1 :]))
 
