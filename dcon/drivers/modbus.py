@@ -107,4 +107,6 @@ class Bus:
 
 def _reason(error: Exception) -> str:
     text = str(error)
-    return "no answer in time" if "No response" in text or "not responding" in text else text or type(error).__name__
+    if "No response" in text or "not responding" in text:
+        return "no answer in time"
+    return "the device closed the connection" if "closed" in text else text or type(error).__name__

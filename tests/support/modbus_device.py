@@ -65,6 +65,9 @@ class Device:
             try:
                 self._loop.run_until_complete(serve())
             finally:
+                for task in asyncio.all_tasks(self._loop):
+                    task.cancel()
+                self._loop.run_until_complete(asyncio.sleep(0))
                 self._loop.close()
 
         self._thread = threading.Thread(target=run, daemon=True)
