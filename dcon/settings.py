@@ -57,8 +57,8 @@ class LineInput:
     """``[pdci]``: where the line's status comes from. What it is judged by is :class:`~dcon.core.params.Line`."""
 
     url: LineSource | None = field(default=None, metadata=parsed_by(line_source))
-    """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device that
-    is asked (see the page on outputs); without it the status is not known."""
+    """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device to be
+    asked (see the page on outputs); without it the status is not known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,7 +106,12 @@ def test_where_the_range_of_counts_comes_from(
 @pytest.mark.parametrize(
     ("files", "keys", "error", "message"),
     [
-        ({"out_voltage_scale": f"{SCALE_MV / 1e3}"}, {}, SourceError, r"reaches -0.01 to 0.00999969 V; ±10 V are needed"),
+        (
+            {"out_voltage_scale": f"{SCALE_MV / 1e3}"},
+            {},
+            SourceError,
+            r"reaches -0.01 to 0.00999969 V; ±10 V are needed",
+        ),
         ({"out_voltage_scale": f"{SCALE_MV / 2}"}, {}, SourceError, r"reaches -5 to 4.99985 V"),
         ({"out_voltage_offset": "0"}, {}, SourceError, r"reaches 0 to 19.9997 V; ±10 V are needed"),
         ({"out_voltage_scale": f"{SCALE_MV * 1000}"}, {}, SourceError, "its scale must be in mV a count"),

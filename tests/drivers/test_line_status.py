@@ -63,7 +63,9 @@ def test_the_newest_that_is_believable_counts() -> None:
         encode(6, LINE._replace(scheduled_mw=math.inf)),
         encode(7, LINE._replace(time_ns=UTC_NS + 2_000_000_000)),
     ]
-    assert inbox.take([encode(4, LINE), encode(5, LINE._replace(power_mw=1.0))], 0, UTC_NS) == LINE._replace(power_mw=1.0)
+    assert inbox.take([encode(4, LINE), encode(5, LINE._replace(power_mw=1.0))], 0, UTC_NS) == LINE._replace(
+        power_mw=1.0
+    )
     assert inbox.take([*nonsense, encode(5, LINE), encode(3, LINE)], 1, UTC_NS) is None
     assert inbox.refused == {"malformed": 2, "not a number": 2, "from the future": 1, "old": 2}
     assert inbox.taken == 2

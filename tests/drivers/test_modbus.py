@@ -51,7 +51,9 @@ def test_floats_there_and_back(value: float) -> None:
     assert struct.pack(">HH", *words) == struct.pack(">f", value)
 
 
-@pytest.mark.parametrize(("kind", "value"), [("int16", 32768.0), ("int16", math.nan), ("float32", 1e39), ("float32", math.inf)])
+@pytest.mark.parametrize(
+    ("kind", "value"), [("int16", 32768.0), ("int16", math.nan), ("float32", 1e39), ("float32", math.inf)]
+)
 def test_what_does_not_fit_is_refused(kind: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"is no {kind}"):
         to_registers(kind, value)
@@ -129,7 +131,16 @@ def answering(reply: Callable[[bytes], bytes]) -> Iterator[int]:
         lambda asked: asked[:2] + b"\0\0\0\2\1\x83",
         lambda asked: b"",
     ],
-    ids=["http", "zeros", "too few registers", "another's answer", "cut off", "another unit", "half an exception", "none"],
+    ids=[
+        "http",
+        "zeros",
+        "too few registers",
+        "another's answer",
+        "cut off",
+        "another unit",
+        "half an exception",
+        "none",
+    ],
 )
 def test_answers_that_are_none(reply: Callable[[bytes], bytes]) -> None:
     with answering(reply) as port:

@@ -18,7 +18,9 @@ def test_what_urls_mean() -> None:
     assert str(destination("modbus://[::1]:1502")) == "modbus://[::1]:1502?unit=1&register=0"
     line = line_source("modbus://192.0.2.7:1502?power=2&scheduled=6&status=8&counter=9")
     assert isinstance(line, ModbusLine) and (line.keys.power, line.keys.scheduled, line.keys.counter) == (2, 6, 9)
-    assert str(destination("udp://192.0.2.7:4790")) == str(line_source("udp://192.0.2.7:4790")) == "udp://192.0.2.7:4790"
+    assert (
+        str(destination("udp://192.0.2.7:4790")) == str(line_source("udp://192.0.2.7:4790")) == "udp://192.0.2.7:4790"
+    )
 
 
 @pytest.mark.parametrize(
