@@ -1,0 +1,69 @@
+"""Signed orders on their way to the control process: who may pass is decided here, and nowhere else.
+
+The server only hands on what operators have signed; it cannot make an order. What is refused becomes an input of the
+controller too, so that it is in the session log and replays.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dcon.core.values import Order
+from dcon.link.orders import Operator, RefusalLog, Refused, Verifier, digest
+from dcon.platform import sequences
+from pmutools.timebase import NS
+
+
+class Passed(NamedTuple):
+    """What became of one datagram."""
+
+    news: dict[str, Any] | None = None
+    """For the control process."""
+    reply_to: str = ""
+    """Path of the socket that wants to hear; "" is nobody's."""
+    reply: dict[str, Any] = {}  # noqa: RUF012  # never changed
+
+
+class OrderGate:
+    """Verifies orders, remembers what was accepted in ``operators.seq``, and tells of what is refused."""
+
+    def __init__(self, operators: Mapping[str, Operator], window_s: float, run_dir: Path, utc_ns: int) -> None:
+        self._file = run_dir / sequences.FILE
+        last, floor_ns = sequences.load(self._file, utc_ns)
+        self.verifier = Verifier(operators, window_ns=round(window_s * NS), last=last, floor_ns=floor_ns)
+        self._refusals = RefusalLog()
+        self.accepted = self.refused = 0
+        self.malformed = 0
+        """Datagrams that are not even ``{"kind": "signed", ...}``."""
+
+    def take(self, datagram: bytes, now_ns: int, utc_ns: int) -> Passed:
+        """Judge ``{"kind": "signed", "order": HEX, "reply_to": PATH}``. Never raises.
+
+        ``now_ns`` is of a clock without steps. What is accepted is remembered before it is passed on.
+        """
+        try:
+            said = json.loads(datagram)
+            if said["kind"] != "signed":
+                raise ValueError("another kind")
+            signed = bytes.fromhex(said["order"])
+            reply_to = str(said.get("reply_to") or "")
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            self.malformed += 1
+            return Passed()
+        found = self.verifier.verify(signed, utc_ns)
+        reply = {"kind": "reply", "digest": digest(signed), "accepted": True, "reason": ""}
+        if isinstance(found, Refused):
+            self.refused += 1
+            told = self._refusals.order(found, signed, now_ns)
+            news = None if told is None else _order(told)
+            return Passed(news, reply_to, {**reply, "accepted": False, "reason": found.reason})
+        self.accepted += 1
+        sequences.save(self._file, self.verifier.last)
+        return Passed(_order(found.order), reply_to, reply)
+
+
+def _order(order: Order) -> dict[str, Any]:
+    return {"kind": "order", **order._asdict()}
