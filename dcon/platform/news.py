@@ -83,10 +83,10 @@ def _pdci(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
 
 
 def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
-    name, text, who = (said.get(key, "") for key in ("name", "text", "who"))
-    if not (isinstance(name, str) and isinstance(text, str) and isinstance(who, str)):
+    name, text, who, why = (said.get(key, "") for key in ("name", "text", "who", "why"))
+    if not all(isinstance(word, str) for word in (name, text, who, why)):
         raise TypeError("an order is words")
-    return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who))
+    return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who, why))
 
 
 def _server(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:

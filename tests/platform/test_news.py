@@ -103,7 +103,7 @@ def test_a_server_that_never_spoke_is_silent_since_the_start() -> None:
 def test_an_order_is_handed_on_once_with_who_ordered_it() -> None:
     said = {"kind": "order", "name": "gain", "value": 12.5, "text": "", "who": "ann", "why": "test"}
     after, order = hear(Heard(T0), json.dumps(said).encode(), T0)
-    assert order == Order("gain", 12.5, "", "ann")
+    assert order == Order("gain", 12.5, "", "ann", "test")
     assert hear(after, status(T0), T0).order is None
     refused = hear(after, json.dumps({"kind": "order", "name": "link_refused", "text": "bad mac"}).encode(), T0).order
     assert refused == Order("link_refused", 0.0, "bad mac", "")

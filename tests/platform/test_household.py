@@ -1,0 +1,215 @@
+"""``dcon run`` looks after its processes: here small programs are in their places, and bind what the real ones bind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from dcon.link.notify import Notifier
+from dcon.link.paths import prepare
+from dcon.platform.household import ENDED, STARTED, Household
+from pmutools.errors import SourceError
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's"),
+]
+STAND_IN = """
+import os, signal, socket, sys, time
+path, kind, log, name, life, code, deaf = sys.argv[1:]
+def note(what):
+    with open(log, "a") as file: file.write(f"{what} {name} {os.getpid()} {time.monotonic_ns()}\\n")
+def end(*_):
+    note("term"); sys.exit(int(code))
+signal.signal(signal.SIGTERM, signal.SIG_IGN if deaf == "deaf" else end)
+signal.signal(signal.SIGINT, lambda *_: note("int"))
+if os.path.exists(path): os.unlink(path)
+sock = socket.socket(socket.AF_UNIX, int(kind))
+sock.bind(path)
+if int(kind) == socket.SOCK_SEQPACKET: sock.listen(8)
+note("start")
+time.sleep(float(life))
+print('{"ticks": 7}')
+note("over"); sys.exit(int(code))
+"""
+
+
+class House:
+    """Stand-ins that live for so long and end with a code."""
+
+    def __init__(self, folder: Path, *, output: bool = False) -> None:
+        self.folder = prepare(folder / "run")
+        self.log = folder / "log"
+        self.log.write_text("")
+        self.lives: dict[str, list[tuple[float, int]]] = {}
+        """(seconds, exit code) of each life, by name; the last goes on."""
+        self.deaf = ""
+        """Who does not end when asked to."""
+        names = [member.name for member in STARTED if output or member.name != "output"]
+        self.household = Household(self.folder, {name: self.command(name) for name in names})
+
+    def command(self, name: str) -> Callable[[], Sequence[str]]:
+        member = next(member for member in STARTED if member.name == name)
+
+        def made() -> Sequence[str]:
+            lives = self.lives.get(name, [(60.0, 0)])
+            life_s, code = lives.pop(0) if len(lives) > 1 else lives[0]
+            words = (self.folder / member.inbox, int(member.kind), self.log, name, life_s, code)
+            return ["-c", STAND_IN, *map(str, words), "deaf" if name == self.deaf else "-"]
+
+        return made
+
+    def events(self, what: str) -> list[str]:
+        """Names, in the order in which it happened to them."""
+        return [line.split()[1] for line in self.log.read_text().splitlines() if line.startswith(what + " ")]
+
+    def pids(self) -> list[int]:
+        return [int(line.split()[2]) for line in self.log.read_text().splitlines() if line.startswith("start ")]
+
+    def stop_when(self, ready: Callable[[], bool]) -> None:
+        def wait() -> None:
+            end_s = time.monotonic() + 20
+            while not ready() and time.monotonic() < end_s:
+                time.sleep(0.01)
+            self.household.stop()
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def is_empty(self) -> bool:
+        return not any(alive(pid) for pid in self.pids())
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_they_start_in_order_each_when_the_one_before_is_ready_and_end_in_order(tmp_path: Path) -> None:
+    house = House(tmp_path, output=True)
+    house.stop_when(lambda: len(house.events("start")) == 4)
+    house.household.run()
+    assert house.events("start") == [member.name for member in STARTED]
+    assert house.events("term") == [member.name for member in ENDED]
+    assert house.household.outcome.restarts == {}
+    assert house.is_empty()
+
+
+def test_a_controller_whose_time_is_over_ends_the_run_with_its_code_and_its_words(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    house.lives["platform"] = [(0.3, 3)]
+    outcome = house.household.run()
+    assert (outcome.code, outcome.restarts, outcome.said) == (3, {}, '{"ticks": 7}\n')
+    assert house.events("term") == ["server", "watchdog"]
+    assert house.is_empty()
+
+
+@pytest.mark.parametrize("name", ["watchdog", "server", "platform"])
+def test_what_dies_is_started_again_and_the_others_stay(name: str, tmp_path: Path) -> None:
+    house = House(tmp_path)
+    house.lives[name] = [(0.2, 1), (0.2, 1), (60, 0)]
+    house.stop_when(lambda: house.events("start").count(name) == 3)
+    began_s = time.monotonic()
+    outcome = house.household.run()
+    assert outcome.restarts == {name: 2}
+    assert sorted(house.events("start")) == sorted([*["watchdog", "server", "platform"], name, name])
+    assert time.monotonic() - began_s > 0.25 + 0.5  # later and later
+    assert house.is_empty()
+
+
+def test_a_controller_that_was_set_up_wrongly_is_not_started_again(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    house.lives["platform"] = [(0.3, 2)]
+    assert house.household.run().code == 2
+    assert house.events("start") == ["watchdog", "server", "platform"]
+
+
+def test_one_that_cannot_start_ends_the_others_in_one_line(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    house.household._commands["server"] = lambda: ["-c", "raise SystemExit(1)"]  # type: ignore[index]
+    with pytest.raises(SourceError, match=r"^the server process could not start, exit code 1$"):
+        house.household.run()
+    assert house.events("start") == ["watchdog"] and house.is_empty()
+
+
+def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    house = House(tmp_path)
+    house.deaf = "server"
+    for name, each in house.household._running.items():
+        house.household._running[name].member = each.member._replace(patience_s=0.3)
+    house.stop_when(lambda: len(house.events("start")) == 3)
+    house.household.run()
+    assert house.events("term") == ["watchdog"] or house.events("term") == ["platform", "watchdog"]
+    assert house.is_empty()
+
+
+def test_a_stop_while_they_start_ends_what_has_started(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    house.household._commands["server"] = lambda: ["-c", "import time; time.sleep(60)"]  # type: ignore[index]
+    house.stop_when(lambda: house.events("start") == ["watchdog"])
+    house.household.run()
+    assert house.events("term") == ["watchdog"] and house.is_empty()
+
+
+def test_systemd_is_told(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as service:
+        service.bind(str(tmp_path / "notify"))
+        service.settimeout(5)
+        house.household._notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        house.stop_when(lambda: len(house.events("start")) == 3)
+        house.household.run()
+        assert service.recv(100) == b"READY=1\nSTATUS=running"
+        rest = []
+        service.setblocking(False)
+        while True:
+            try:
+                rest.append(service.recv(100))
+            except BlockingIOError:
+                break
+    assert rest[-1] == b"STOPPING=1\nSTATUS=ending" and set(rest[:-1]) <= {b"WATCHDOG=1\nSTATUS=running"}
+
+
+ALONE = """
+import sys
+sys.path[:0] = sys.argv[2:]
+from pathlib import Path
+from test_household import House
+house = House(Path(sys.argv[1]), output=True)
+with house.household.stopped_by_signals():
+    house.household.run()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_nobody_is_left_however_it_ends(number: signal.Signals, tmp_path: Path) -> None:
+    """Ctrl-C at a terminal goes to the whole group: it must not reach the others past their order."""
+    here = Path(__file__).parent
+    paths = [str(tmp_path), str(here), str(here.parents[1]), str(here.parent)]
+    with subprocess.Popen([sys.executable, "-c", ALONE, *paths], start_new_session=True) as run:
+        log = tmp_path / "log"
+        end_s = time.monotonic() + 20
+        while not log.exists() or log.read_text().count("start ") < 4:
+            assert time.monotonic() < end_s and run.poll() is None
+            time.sleep(0.02)
+        os.killpg(run.pid, number)
+        run.wait(20)
+    pids = [int(line.split()[2]) for line in log.read_text().splitlines() if line.startswith("start ")]
+    end_s = time.monotonic() + 5
+    while any(map(alive, pids)):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    ended = [line.split()[1] for line in log.read_text().splitlines() if line.startswith("term ")]
+    order = [member.name for member in ENDED]
+    assert ended == order if number != signal.SIGKILL else sorted(ended) == sorted(order)
+    assert "int " not in log.read_text()
