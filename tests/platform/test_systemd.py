@@ -1,0 +1,84 @@
+"""The systemd units of the documentation: what systemd itself says of them, and what must be in them."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from dcon.cli import COMMANDS
+from dcon.cli.run import command as run_command
+from dcon.platform.household import ENDED, STARTED
+
+UNITS = Path(__file__).parents[2] / "docs" / "systemd"
+PROGRAM = "/opt/pmutools/bin/dcon"
+SERVICES = sorted(UNITS.glob("*.service"))
+
+
+def keys(unit: Path) -> dict[str, list[str]]:
+    """Values of each ``SECTION.KEY``, in order."""
+    found = defaultdict(list)
+    section = ""
+    for line in unit.read_text().splitlines():
+        if line.startswith("["):
+            section = line.strip("[]")
+        elif "=" in line and not line.startswith("#"):
+            key, _, value = line.partition("=")
+            found[f"{section}.{key}"].append(value)
+    return found
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_finds_nothing_wrong(tmp_path: Path) -> None:
+    for unit in UNITS.iterdir():
+        text = unit.read_text()
+        assert text.count(PROGRAM) == (unit.suffix == ".service")
+        (tmp_path / unit.name).write_text(text.replace(PROGRAM, "/bin/true"))
+    names = [str(tmp_path / unit.name) for unit in UNITS.iterdir()]
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *names],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={"SYSTEMD_UNIT_PATH": f"{tmp_path}:", "PATH": "/usr/bin:/bin"},
+    )
+    own = [line for line in done.stderr.splitlines() if "dcon" in line]
+    assert (done.returncode, own) == (0, [])
+
+
+def test_there_is_a_unit_for_each_process_and_one_for_all() -> None:
+    assert {unit.name for unit in SERVICES} == {"dcon.service", *(f"dcon-{member.name}.service" for member in STARTED)}
+
+
+@pytest.mark.parametrize("unit", SERVICES, ids=lambda unit: str(unit.stem))
+def test_what_must_be_in_a_unit(unit: Path) -> None:
+    found = keys(unit)
+    (start,) = found["Service.ExecStart"]
+    program, name, *options = shlex.split(start)
+    assert program == PROGRAM and name in COMMANDS
+    assert name == ("run" if unit.stem == "dcon" else unit.stem.removeprefix("dcon-"))
+    assert options == ["--ini", "/etc/dcon/site.ini", "--run-dir", "/var/lib/dcon/run"]
+    assert found["Service.KillMode"] == ["mixed"]  # the others are ended by whoever started them, in order
+    assert found["Service.RestartPreventExitStatus"] == ["2"]
+    assert found["Service.SuccessExitStatus"] == ["130"]
+    assert found["Service.StateDirectoryMode"] == ["0700"]  # nobody else may enter the run folder
+    assert ("Service.WatchdogSec" in found) == (found["Service.Type"] == ["notify"])
+    assert found["Service.Restart"] == ["on-failure"]
+
+
+def test_systemd_waits_longer_for_the_end_than_dcon_run_does() -> None:
+    (limit,) = keys(UNITS / "dcon.service")["Service.TimeoutStopSec"]
+    assert float(limit) > sum(member.patience_s for member in ENDED)
+    assert {option.name for option in run_command.params} >= {"ini", "run_dir"}
+
+
+def test_the_platform_starts_last_and_so_ends_first() -> None:
+    for member in STARTED[:-1]:
+        assert keys(UNITS / f"dcon-{member.name}.service")["Unit.Before"] == ["dcon-platform.service"]
+    for member in STARTED:
+        found = keys(UNITS / f"dcon-{member.name}.service")
+        assert found["Unit.PartOf"] == ["dcon.target"] and found["Install.WantedBy"] == ["dcon.target"]
