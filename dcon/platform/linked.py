@@ -23,16 +23,17 @@ from dcon.link.paths import Sender
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
 from dcon.platform.children import Children
-from dcon.platform.news import Heard, hear, is_healthy, surroundings
+from dcon.platform.news import Heard, hear, is_healthy, surroundings, watchdog_of
 from dcon.platform.ports import Ends, Told
 from dcon.platform.pulse import Pulse
-from dcon.session.codec import Timing
-from dcon.session.encode import tick_entries
+from dcon.session.codec import Timing, Watchdog
+from dcon.session.encode import tick_entries, watchdog_entry
 from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.clock import Clock
 from pmutools.errors import SourceError
 from pmutools.net.sockets import raise_sndbuf
+from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 PAIR_BYTES = 4 << 20
@@ -144,17 +145,18 @@ class RunNews:
 
 
 class ShippedLog:
-    """The session log, by way of the server."""
+    """The session log, by way of the server. It has the watchdog's state too: each second, and when it changes."""
 
     parts: tuple[str, ...] = ()
 
-    def __init__(self, head: Head, settings: Settings, server: Path, clock: Clock) -> None:
+    def __init__(self, head: Head, settings: Settings, server: Path, news: RunNews, clock: Clock) -> None:
         session = random.getrandbits(32)  # tells this session from the one before, to a server that was there
         limits = settings.log
         ring = Ring(round(limits.backfill_s * 1e9), round(limits.backfill_mb * 1e6))
         self._instances = head.instances
         self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
-        self._clock = clock
+        self._news, self._clock = news, clock
+        self._shown: Watchdog | None = None
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
@@ -169,9 +171,18 @@ class ShippedLog:
         surroundings: Surroundings = NOTHING,
     ) -> None:
         entries = tick_entries(self._instances, record, readings, orders, timing=timing, surroundings=surroundings)
+        if (watchdog := watchdog_of(self._news.heard, record.tick_ns)) is not None and self._is_due(watchdog):
+            entries.append(watchdog_entry(watchdog))
+            self._shown = watchdog
         now_ns = self._clock.monotonic_ns()
         self._shipping.shipper.tick(record.tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
+
+    def _is_due(self, watchdog: Watchdog) -> bool:
+        shown = self._shown
+        return (
+            shown is None or watchdog.time_ns - shown.time_ns >= NS or watchdog._replace(time_ns=shown.time_ns) != shown
+        )
 
     @property
     def unlogged_ticks(self) -> int:
@@ -202,7 +213,10 @@ class Linked:
         self._frames = PairFrames(ours, clock)
         self._news = RunNews(inbox, self._children, command, clock)
         self.ends = Ends(
-            self._frames, lambda head: ShippedLog(head, settings, folder / paths.SERVER, clock), command, self._news
+            self._frames,
+            lambda head: ShippedLog(head, settings, folder / paths.SERVER, self._news, clock),
+            command,
+            self._news,
         )
         here = ("--ini", str(ini), "--run-dir", str(folder))
         try:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
+from dcon.session.codec import Watchdog
 
 STATUS_NS = 100_000_000
 """A watchdog that has said nothing for so long is not healthy."""
@@ -124,6 +125,15 @@ def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
         server_age_s=silent_ns / 1e9,
         disk_free_percent=server.disk_free_percent,
     )
+
+
+def watchdog_of(heard: Heard, time_ns: int) -> Watchdog | None:
+    """The watchdog's state for the log, as known at ``time_ns`` (POSIX UTC); None before it has said anything."""
+    status = heard.status
+    if status is None:
+        return None
+    latched = status.state is WatchdogState.TRIPPED
+    return Watchdog(time_ns, status.closed, not status.estop_released, latched, " ".join(status.causes))
 
 
 def is_healthy(heard: Heard, now_ns: int) -> bool:

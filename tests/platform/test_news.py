@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, encode_readback
-from dcon.platform.news import GPS_NS, SERVER_NS, STATUS_NS, Heard, hear, is_healthy, surroundings
+from dcon.platform.news import GPS_NS, SERVER_NS, STATUS_NS, Heard, hear, is_healthy, surroundings, watchdog_of
+from dcon.session.codec import Watchdog
 from dcon.watchdog.codec import encode_status
 
 T0 = 10**12
@@ -30,8 +31,8 @@ def heard(*news: tuple[int, bytes | dict[str, Any]]) -> Heard:
     return now
 
 
-def status(at: int, *, healthy: bool = True, estop: int = 7, state: int = 0) -> bytes:
-    return encode_status(1, at, 0, estop, state, healthy, 0)
+def status(at: int, *, healthy: bool = True, estop: int = 7, state: int = 0, relays: int = 0, causes: int = 0) -> bytes:
+    return encode_status(1, at, relays, estop, state, healthy, causes)
 
 
 def test_at_the_start_nothing_is_known_and_the_watchdog_is_not_healthy() -> None:
@@ -107,6 +108,14 @@ def test_an_order_is_handed_on_once_with_who_ordered_it() -> None:
     assert hear(after, status(T0), T0).order is None
     refused = hear(after, json.dumps({"kind": "order", "name": "link_refused", "text": "bad mac"}).encode(), T0).order
     assert refused == Order("link_refused", 0.0, "bad mac", "")
+
+
+def test_the_watchdog_s_state_as_the_log_has_it() -> None:
+    assert watchdog_of(heard(), 5) is None
+    tripped = status(T0, estop=6, healthy=False, state=WatchdogState.TRIPPED, relays=1, causes=1 | 1 << 17)
+    assert watchdog_of(heard((T0, tripped)), 5) == Watchdog(5, False, True, True, "control estop_software")
+    closed = status(T0, state=WatchdogState.CLOSED, relays=3)
+    assert watchdog_of(heard((T0, closed)), 5) == Watchdog(5, True)
 
 
 BAD = [
