@@ -169,19 +169,19 @@ def answered(rules: Rules, memory: Memory, readback: Readback, now_ns: int) -> M
     return memory._replace(readback_ns=now_ns, readbacks_off=0 if good else memory.readbacks_off + 1)
 
 
+def _since(wrong: bool, before_ns: int | None, now_ns: int) -> int | None:
+    return (now_ns if before_ns is None else before_ns) if wrong else None
+
+
 def looked(memory: Memory, inputs: Inputs, now_ns: int) -> Memory:
     """The input files were read."""
     differ = None not in (inputs.estop_a, inputs.estop_b) and inputs.estop_a != inputs.estop_b
     ordered = Contact.CLOSED if memory.state is State.CLOSED else Contact.OPEN
-
-    def since(wrong: bool, before_ns: int | None) -> int | None:
-        return (now_ns if before_ns is None else before_ns) if wrong else None
-
     a, b = (
-        since(contact is not None and contact is not ordered, before_ns)
+        _since(contact is not None and contact is not ordered, before_ns, now_ns)
         for contact, before_ns in zip((inputs.contact_a, inputs.contact_b), memory.wrong_ns, strict=True)
     )
-    return memory._replace(inputs=inputs, differ_ns=since(differ, memory.differ_ns), wrong_ns=(a, b))
+    return memory._replace(inputs=inputs, differ_ns=_since(differ, memory.differ_ns, now_ns), wrong_ns=(a, b))
 
 
 def spoken(memory: Memory, word: Word) -> Memory:

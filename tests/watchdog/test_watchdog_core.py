@@ -343,6 +343,7 @@ def test_a_server_that_was_heard_and_is_silent_is_told_once() -> None:
     for _ in range(300):
         bench.tick()
     assert bench.named == ["close", "warning"] and bench.state is State.CLOSED
+    assert [finding.rule.name for finding in bench.events[-1].found] == ["server_silent"]
     assert bench.causes == ("server",) and bench.decision.healthy  # type: ignore[union-attr]
     bench.tick(Beat(server, 2, 1))
     bench.tick(Beat(server, 3, 1))
