@@ -36,6 +36,20 @@ TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
 T = TypeVar("T")
 
 
+def _destination(text: str) -> Endpoint:
+    where = endpoint(text)
+    if where.scheme is not Scheme.UDP or not where.port:
+        raise ValueError(f"{text}: commands leave as udp://HOST:PORT")
+    return where
+
+
+def _listening(text: str) -> Endpoint:
+    where = endpoint(text if "://" in text else f"tcp://{text}")
+    if where.scheme is not Scheme.TCP or not where.port:
+        raise ValueError(f"{text}: operators connect to HOST:PORT, over TCP")
+    return where
+
+
 @dataclass(frozen=True, slots=True)
 class Output:
     """``[output]``: where the command goes."""
@@ -181,6 +195,12 @@ class Server:
 
     required: bool = field(default=False, metadata=parsed_by(boolean))
     """The server must be heard: without it no arming; a loss warns."""
+    listen: Endpoint = field(default=Endpoint(Scheme.TCP, "127.0.0.1", 4790), metadata=parsed_by(_listening))
+    """``HOST:PORT`` for operators. Orders are signed, what is told is not secret to who can connect."""
+    keys: str | None = field(default=None, metadata=parsed_by(str))
+    """File of operators and their keys (``dcon keys``); without it nobody orders anything."""
+    window_s: float = field(default=5.0, metadata=parsed_by(number(0.1, 60)))
+    """An order's time may differ so much from the platform's clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,9 +214,9 @@ class Log:
     max_minutes: float = field(default=60.0, metadata=parsed_by(number(1, 1e6)))
     """So is one that spans so much time."""
     backfill_s: float = field(default=120.0, metadata=parsed_by(number(1, 3600)))
-    """What the controller keeps for a server that is away: so much time,"""
-    backfill_mb: float = field(default=64.0, metadata=parsed_by(number(1, 1000)))
-    """and at most so much memory."""
+    """The controller keeps so much of its log for a server that is away ..."""
+    backfill_mb: float = field(default=64.0, metadata=parsed_by(number(1, 4096)))
+    """... and at most so many megabytes: memory that is locked."""
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,12 @@ class RefusalLog:
         return Order(LINK_REFUSED, text=text, who=refused.who, why=digest(signed))
 
 
+def read(signed: bytes) -> SignedOrder | Refused:
+    """What it says, whoever signed it."""
+    parsed = _parsed(signed)
+    return parsed if isinstance(parsed, Refused) else parsed[0]
+
+
 def _canonical(values: Mapping[str, object]) -> bytes:
     return json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 

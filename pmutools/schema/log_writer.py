@@ -12,7 +12,7 @@ import pmutools
 from pmutools.errors import SourceError
 from pmutools.schema.descriptors import file_descriptor_set, full_name
 from pmutools.schema.mcap_parts import OpenChunk, Summary, serialised
-from pmutools.schema.mcap_records import MAGIC
+from pmutools.schema.mcap_records import FOOTER, MAGIC, RECORD_HEAD, Op
 from pmutools.timebase import NS
 
 CHUNK_NS = NS
@@ -158,3 +158,19 @@ class LogWriter:
         self._closed = True
         if self._owned and self._stream is not None:
             self._stream.close()
+
+
+def seal(path: str | os.PathLike[str], size: int) -> None:
+    """End a log whose writer died after its first ``size`` bytes, without an index; what follows them is cut off.
+
+    Raises OSError where that cannot be done, ValueError where the file is shorter.
+    """
+    from mcap.records import DataEnd
+
+    end = serialised(DataEnd(0)) + FOOTER.pack(Op.FOOTER, FOOTER.size - RECORD_HEAD.size, 0, 0, 0) + MAGIC
+    with open(path, "r+b") as file:
+        if file.seek(0, os.SEEK_END) < size:
+            raise ValueError(f"{path}: shorter than {size} bytes")
+        file.truncate(size)
+        file.seek(size)
+        file.write(end)

@@ -1,0 +1,78 @@
+"""The operator's end of the server's lines."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any
+
+from dcon.server.pending import PATIENCE_NS
+from pmutools.errors import SourceError
+from pmutools.net.endpoint import Endpoint, join_host
+from pmutools.timebase import NS
+
+CONNECT_S = 3.0
+ANSWER_S = PATIENCE_NS / NS + 3.0
+LONGEST_ANSWER = 1 << 20
+
+
+class Client:
+    """A connection; raises SourceError where the server cannot be reached, or does not answer."""
+
+    def __init__(self, where: Endpoint) -> None:
+        self._name = join_host(where.host, where.port)
+        self._rest = b""
+        try:
+            self._sock = socket.create_connection((where.host, where.port), CONNECT_S)
+        except OSError as error:
+            raise SourceError(f"{self._name}: {error.strerror or error}; is dcon server running there?") from None
+        self._sock.settimeout(ANSWER_S)
+
+    def ask(self, asked: dict[str, Any]) -> dict[str, Any]:
+        """Send, and await the answer."""
+        self.send(asked)
+        return self._answer()
+
+    def send(self, asked: dict[str, Any]) -> None:
+        try:
+            self._sock.sendall(json.dumps(asked).encode() + b"\n")
+        except OSError as error:
+            raise SourceError(f"{self._name}: {error.strerror or error}") from None
+
+    def answers(self) -> Iterator[dict[str, Any]]:
+        """All that come."""
+        while True:
+            yield self._answer()
+
+    def close(self) -> None:
+        self._sock.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _answer(self) -> dict[str, Any]:
+        while b"\n" not in self._rest:
+            try:
+                data = self._sock.recv(65536)
+            except TimeoutError:
+                raise SourceError(f"{self._name}: no answer in {ANSWER_S:g} s") from None
+            except OSError as error:
+                raise SourceError(f"{self._name}: {error.strerror or error}") from None
+            if not data:
+                raise SourceError(f"{self._name}: the server ended the connection")
+            self._rest += data
+            if len(self._rest) > LONGEST_ANSWER:
+                raise SourceError(f"{self._name}: not what a dcon server says")
+        line, _, self._rest = self._rest.partition(b"\n")
+        try:
+            said = json.loads(line)
+        except ValueError:
+            said = None
+        if not isinstance(said, dict):
+            raise SourceError(f"{self._name}: not what a dcon server says")
+        return said

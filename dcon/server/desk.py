@@ -1,0 +1,106 @@
+"""What operators may ask, and what they are told: the same for a line of a socket and, one day, for a web page.
+
+An ask is a JSON object: ``{"ask": "status"}``, ``{"ask": "watch"}``, or ``{"signed": "<a signed order>"}``. Orders are
+relayed as they are; only the controller and the watchdog act, and the server has no key of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
+from typing import Any
+
+from dcon.link.orders import LONGEST, Operator, SignedOrder, Verifier
+from dcon.link.paths import AIDE, WATCHDOG, Sender
+from dcon.server import words
+from dcon.server.newest import News
+from dcon.server.pending import Answer, Pending
+
+LOG = logging.getLogger(__name__)
+ASKS = ("status", "watch")
+
+
+class Desk:
+    """Answers asks. An ask's answer comes at once, or (None) from :meth:`heard`, :meth:`reply` or :meth:`expired`."""
+
+    def __init__(
+        self, folder: Path, operators: Mapping[str, Operator], status: Callable[[], dict[str, Any]], verifier: Verifier
+    ) -> None:
+        """``verifier`` is asked before the watchdog is told; ``operators`` may be none: then nobody orders anything."""
+        self._status = status
+        self._operators = operators
+        self._verifier = verifier
+        self._folder = folder
+        self._aide = Sender(folder / AIDE)
+        self._watchdog = Sender(folder / WATCHDOG)
+        self.reply_to = ""
+        """Path of the socket that the platform's link may answer to."""
+        self.pending = Pending()
+        self.relayed = 0
+
+    def ask(self, asker: Hashable, line: bytes, *, utc_ns: int, now_ns: int) -> dict[str, Any] | None:
+        """The answer; None where it will come. ``{"watch": true}`` where the asker wants a status from now on."""
+        try:
+            said = json.loads(line)
+        except (ValueError, RecursionError):
+            return _error("no JSON")
+        if not isinstance(said, dict):
+            return _error("no JSON object")
+        match said:
+            case {"ask": "status"}:
+                return self._status()
+            case {"ask": "watch"}:
+                return {"watch": True}
+            case {"signed": str(text)}:
+                return self._signed(asker, text, utc_ns, now_ns)
+        return _error(f"ask for one of {', '.join(ASKS)}, or send a signed order")
+
+    def heard(self, news: News) -> list[Answer]:
+        return self.pending.heard(news)
+
+    def reply(self, datagram: bytes) -> list[Answer]:
+        """What the platform's link says of an order: ``{"digest", "refused"}``."""
+        try:
+            said = json.loads(datagram)
+        except (ValueError, RecursionError):
+            return []
+        match said:
+            case {"digest": str(name), "refused": str(reason)}:
+                return self.pending.refused(name, reason)
+        return []
+
+    def close(self) -> None:
+        self._aide.close()
+        self._watchdog.close()
+
+    def _signed(self, asker: Hashable, text: str, utc_ns: int, now_ns: int) -> dict[str, Any] | None:
+        signed = text.encode(errors="replace")
+        if len(signed) > LONGEST:
+            return {"refused": f"longer than {LONGEST} bytes"}
+        if not self._operators:
+            return {"refused": "this server knows no operators: set keys in [server]"}
+        if self.pending.is_full:
+            return {"refused": "too many orders are on their way"}
+        told = self._tell_watchdog(signed, utc_ns)
+        self.relayed += 1
+        message = {"kind": "signed", "order": signed.hex(), "reply_to": self.reply_to}
+        if not self._aide.send(json.dumps(message).encode()):
+            return {"refused": f"the controller cannot be reached{told}"}
+        self.pending.add(asker, signed, now_ns, told)
+        return None
+
+    def _tell_watchdog(self, signed: bytes, utc_ns: int) -> str:
+        """Of what the watchdog was told, in words; "" for nothing. The controller judges the order for itself."""
+        order = self._verifier.verify(signed, utc_ns)
+        if not isinstance(order, SignedOrder) or order.name not in words.WORDS:
+            return ""
+        if not self._watchdog.send(words.word(order.name, order.who)):
+            return "; nor can the watchdog"
+        LOG.warning("%s by %s: the watchdog was told", order.name, order.who)
+        return "; the watchdog was told"
+
+
+def _error(text: str) -> dict[str, Any]:
+    return {"error": text}

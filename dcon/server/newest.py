@@ -1,0 +1,213 @@
+"""What the controller is doing, by the newest bundles: decoded for operators, whatever the disk does."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from typing import Any, NamedTuple
+
+from google.protobuf.message import DecodeError
+
+from dcon.core.rows import CORE
+from dcon.core.values import Event, Order
+from dcon.link.bundle import Bundle, Entry
+from dcon.session import codec
+from dcon.session.head import Head
+from pmutools.schema.descriptors import message_class
+
+EVENTS = 50
+"""The last that are told."""
+MOST_FLAGS = 1000
+"""Entries of the flag register that are kept."""
+TEXTS = {row.name: row.text for row in CORE.rows}
+SHOWN = frozenset(("Tick", "Instance", "Event", "Flag", "Setting", "Surroundings", "Pdci", "Watchdog", "Timing"))
+
+
+class News(NamedTuple):
+    """What one tick tells of orders and of the line."""
+
+    tick_ns: int = 0
+    state: str = ""
+    orders: tuple[Order, ...] = ()
+    events: tuple[Event, ...] = ()
+    driven_v: float | None = None
+    line: tuple[int, float] | None = None
+    """Time and modulation of the line's last report, MW."""
+
+
+class Newest:
+    """The last tick, the flag register and the last events of a session. Memory: bounded by the numbers above."""
+
+    def __init__(self) -> None:
+        self.head = Head("")
+        self.tick_ns = 0
+        self.ticks = 0
+        self.undecodable = 0
+        self._last: dict[str, Any] = {}
+        self._flags: dict[tuple[str, str], Any] = {}
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+
+    def begin(self, head: Head) -> None:
+        """Another session."""
+        self.__init__()  # type: ignore[misc]
+        self.head = head
+
+    def take(self, bundle: Bundle) -> News:
+        """Take in a tick."""
+        news = News(bundle.tick_ns)
+        orders: list[Order] = []
+        events: list[Event] = []
+        for entry in bundle.entries:
+            if entry.message not in SHOWN or (message := self._decoded(entry)) is None:
+                continue
+            if entry.message == "Setting":
+                orders.append(codec.decode_order(message))
+            elif entry.message == "Event":
+                events.append(Event(message.name, message.subject, message.detail))
+                self._events.append({"tick_ns": bundle.tick_ns, **events[-1]._asdict()})
+            elif entry.message == "Flag":
+                self._flag(message)
+            else:
+                self._last[entry.message] = message
+                if entry.message == "Tick":
+                    self.tick_ns, self.ticks = bundle.tick_ns, self.ticks + 1
+                    news = news._replace(state=message.state, driven_v=message.output_v)
+                elif entry.message == "Pdci":
+                    line = message.power_mw - message.scheduled_mw
+                    news = news._replace(line=(message.time_ns, line if math.isfinite(line) else message.power_mw))
+        return news._replace(orders=tuple(orders), events=tuple(events))
+
+    def status(self) -> dict[str, Any]:
+        """For operators; what is not known is None."""
+        tick, told = self._last.get("Tick"), self._last.get("Surroundings")
+        if tick is None:
+            return {"state": None, "flags": [], "instances": [], "pmus": [], "events": []}
+        names, active = self.head.instances, tick.active
+        return {
+            "tick_ns": tick.tick_ns,
+            "state": tick.state,
+            "mode": tick.mode,
+            "active": names[active] if 0 <= active < len(names) else None,
+            "gain_mw_per_mhz": tick.gain_mw_per_mhz,
+            "delta_f_mhz": _number(tick.delta_f_mhz),
+            "command_mw": tick.command_mw,
+            "output_v": tick.output_v,
+            "probe_mw": tick.probe_mw,
+            "flags": self._flags_up(tick.flags),
+            "instances": self._instances(),
+            "pmus": [
+                {"name": name, "age_ms": _number(age), "f_hz": _number(f)}
+                for name, age, f in zip(self.head.pmus, tick.age_ms, tick.f_hz, strict=False)
+            ],
+            "watchdog": self._watchdog(),
+            "surroundings": None if told is None else _surroundings(told),
+            "line": self._line(),
+            "timing": self._timing(),
+            "events": list(self._events),
+        }
+
+    def _decoded(self, entry: Entry) -> Any | None:
+        try:
+            return message_class(entry.message).FromString(entry.data)
+        except DecodeError:
+            self.undecodable += 1
+            return None
+
+    def _flag(self, message: Any) -> None:
+        key = (message.name, message.subject)
+        self._flags.pop(key, None)
+        self._flags[key] = message
+        if len(self._flags) > MOST_FLAGS:
+            self._flags.pop(next(iter(self._flags)))
+
+    def _flags_up(self, bits: int) -> list[dict[str, Any]]:
+        """Those that are up, or latched; of the checks that are up and were not heard of, the name alone."""
+        known = [flag for flag in self._flags.values() if flag.up or flag.latched]
+        shown = [
+            {
+                "name": flag.name,
+                "subject": flag.subject,
+                "text": TEXTS.get(flag.name, ""),
+                "up": flag.up,
+                "latched": flag.latched,
+                "acknowledged": flag.acknowledged,
+                "since_ns": flag.last_ns,
+                "times": flag.times,
+                "value": _number(flag.value),
+                "limit": _number(flag.limit),
+            }
+            for flag in known
+        ]
+        heard = {flag.name for flag in known}
+        for place, name in enumerate(self.head.flags):
+            if bits >> place & 1 and name not in heard:
+                shown.append({"name": name, "subject": "", "text": TEXTS.get(name, ""), "up": True})
+        return shown
+
+    def _instances(self) -> list[dict[str, Any]]:
+        instance = self._last.get("Instance")
+        if instance is None:
+            return []
+        columns = (instance.state, instance.active, instance.delta_f_mhz, instance.command_mw, instance.reason)
+        return [
+            {
+                "name": name,
+                "state": state,
+                "active": active,
+                "delta_f_mhz": _number(delta),
+                "command_mw": command,
+                "reason": reason,
+            }
+            for name, state, active, delta, command, reason in zip(self.head.instances, *columns, strict=False)
+        ]
+
+    def _watchdog(self) -> dict[str, Any] | None:
+        watchdog = self._last.get("Watchdog")
+        if watchdog is None:
+            return None
+        return {
+            "time_ns": watchdog.time_ns,
+            "relays_closed": watchdog.relays_closed,
+            "estop": watchdog.estop,
+            "latched": watchdog.latched,
+            "reason": watchdog.reason,
+            "beats_ms": {
+                name: _number(age) for name, age in zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)
+            },
+        }
+
+    def _line(self) -> dict[str, Any] | None:
+        line = self._last.get("Pdci")
+        if line is None:
+            return None
+        return {
+            "time_ns": line.time_ns,
+            "power_mw": _number(line.power_mw),
+            "scheduled_mw": _number(line.scheduled_mw),
+            "in_service": line.in_service,
+            "dcon_enabled": line.dcon_enabled,
+        }
+
+    def _timing(self) -> dict[str, Any] | None:
+        timing = self._last.get("Timing")
+        if timing is None:
+            return None
+        return (
+            None if timing is None else {"compute_us": _number(timing.compute_us), "late_us": _number(timing.late_us)}
+        )
+
+
+def _surroundings(message: Any) -> dict[str, Any]:
+    told = codec.decode_surroundings(message)._asdict()
+    return {name: _number(value) for name, value in told.items() if name not in ("pdci", "unread")}
+
+
+def _number(value: Any) -> Any:
+    """JSON has no NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def to_json(values: dict[str, Any]) -> bytes:
+    """One line."""
+    return json.dumps(values, separators=(",", ":"), allow_nan=False).encode() + b"\n"

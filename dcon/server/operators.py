@@ -1,0 +1,202 @@
+"""Operators' connections: lines of JSON over TCP, every number bounded.
+
+A client that is too many takes the place of the one that has been silent for longest; one that reads too slowly
+misses statuses, and is cut off where it misses answers.
+"""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import socket
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+from dcon.server.desk import Desk
+from dcon.server.newest import to_json
+from dcon.server.pending import Answer
+from pmutools.net.endpoint import Endpoint
+from pmutools.net.sockets import Address, listening_socket, resolve
+from pmutools.timebase import NS
+
+LOG = logging.getLogger(__name__)
+MOST_CLIENTS = 32
+LONGEST_LINE = 16 << 10
+"""Bytes."""
+LINES_A_SECOND = 20
+"""Of one client; more are answered with an error."""
+IDLE_NS = 60 * NS
+WAITING_BYTES = 256 << 10
+"""To be sent to one client; beyond this it is cut off."""
+WATCHED_BYTES = 64 << 10
+"""Beyond this a watching client gets no new status."""
+
+
+class Client:
+    """One connection."""
+
+    def __init__(self, sock: socket.socket, number: int, now_ns: int) -> None:
+        self.sock = sock
+        self.number = number
+        self.watches = False
+        self.heard_ns = self.drained_ns = now_ns
+        self._in = bytearray()
+        self._out = bytearray()
+        self._recent: deque[int] = deque(maxlen=LINES_A_SECOND)
+
+    @property
+    def waiting(self) -> int:
+        return len(self._out)
+
+    def lines(self, data: bytes) -> list[bytes] | None:
+        """Whole lines, now that ``data`` came; None where one is too long."""
+        self._in += data
+        *whole, rest = self._in.split(b"\n")
+        self._in = bytearray(rest)
+        if max(map(len, (*whole, rest))) > LONGEST_LINE:
+            return None
+        return [bytes(line) for line in whole if line.strip()]
+
+    def is_too_fast(self, now_ns: int) -> bool:
+        fast = len(self._recent) == LINES_A_SECOND and now_ns - self._recent[0] < NS
+        if not fast:
+            self._recent.append(now_ns)
+        return fast
+
+    def say(self, line: bytes) -> bool:
+        """False where the connection is broken, or its client does not read."""
+        self._out += line
+        return self.pump() and len(self._out) <= WAITING_BYTES
+
+    def pump(self) -> bool:
+        """Send what the system takes; false where the connection is broken."""
+        try:
+            while self._out:
+                del self._out[: self.sock.send(self._out)]
+        except BlockingIOError:
+            pass
+        except OSError:
+            return False
+        return True
+
+
+class Operators:
+    """Listens, and brings asks to the desk. The caller's selector tells which sockets are ready."""
+
+    def __init__(self, where: Endpoint, desk: Desk, selector: selectors.BaseSelector) -> None:
+        """Raises SourceError where the port cannot be had."""
+        wanted = resolve(where.host, where.port, datagram=False)
+        self._desk = desk
+        self._selector = selector
+        self._sock = listening_socket(wanted, 64, f"[server] listen {wanted}")
+        family, sockaddr = self._sock.family, self._sock.getsockname()
+        self.address = Address(family, sockaddr)
+        self.clients: dict[int, Client] = {}
+        self.turned_away = 0
+        """Clients that had to make room, or broke a bound."""
+        self._number = 0
+        selector.register(self._sock, selectors.EVENT_READ, self._accept)
+
+    def watched(self, status: bytes, now_ns: int) -> None:
+        """Send a status to who watches, and end what has been idle for long."""
+        for client in list(self.clients.values()):
+            if not client.waiting:
+                client.drained_ns = now_ns
+            if client.watches:
+                fine = client.say(status) if client.waiting <= WATCHED_BYTES else now_ns - client.drained_ns < IDLE_NS
+                self._after(client, fine)
+            elif now_ns - client.heard_ns > IDLE_NS and not self._desk.pending.awaits(client.number):
+                self._end(client)
+
+    @property
+    def is_watched(self) -> bool:
+        return any(client.watches for client in self.clients.values())
+
+    def answer(self, answers: Iterable[Answer]) -> None:
+        for asker, said in answers:
+            if isinstance(asker, int) and (client := self.clients.get(asker)) is not None:
+                self._say(client, said)
+
+    def close(self) -> None:
+        for client in list(self.clients.values()):
+            self._end(client)
+        self._selector.unregister(self._sock)
+        self._sock.close()
+
+    def _accept(self, _events: int, now_ns: int, _utc_ns: int) -> None:
+        try:
+            sock, _ = self._sock.accept()
+        except OSError:  # gone again, or too many files are open: it waits in the backlog
+            return
+        sock.setblocking(False)
+        if len(self.clients) >= MOST_CLIENTS:
+            self.turned_away += 1
+            awaited = self._desk.pending.awaits
+            oldest = min(self.clients.values(), key=lambda c: (c.watches or awaited(c.number), c.heard_ns))
+            self._say(oldest, {"error": "others need this place"})
+            self._end(oldest)
+        self._number += 1
+        client = self.clients[self._number] = Client(sock, self._number, now_ns)
+
+        def ready(events: int, now_ns: int, utc_ns: int) -> None:
+            self._ready(client, events, now_ns, utc_ns)
+
+        self._selector.register(sock, selectors.EVENT_READ, ready)
+
+    def _ready(self, client: Client, events: int, now_ns: int, utc_ns: int) -> None:
+        if client.number not in self.clients:
+            return
+        if events & selectors.EVENT_WRITE:
+            self._after(client, client.pump())
+        if events & selectors.EVENT_READ and client.number in self.clients:
+            self._read(client, now_ns, utc_ns)
+
+    def _read(self, client: Client, now_ns: int, utc_ns: int) -> None:
+        try:
+            data = client.sock.recv(LONGEST_LINE)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._end(client)
+            return
+        client.heard_ns = now_ns
+        lines = client.lines(data)
+        if lines is None:
+            self.turned_away += 1
+            self._say(client, {"error": f"a line is longer than {LONGEST_LINE} bytes"})
+            self._end(client)
+            return
+        for line in lines:
+            if client.number in self.clients:
+                self._ask(client, line, now_ns, utc_ns)
+
+    def _ask(self, client: Client, line: bytes, now_ns: int, utc_ns: int) -> None:
+        if client.is_too_fast(now_ns):
+            self._say(client, {"error": f"more than {LINES_A_SECOND} lines in a second"})
+            return
+        answer = self._desk.ask(client.number, line, utc_ns=utc_ns, now_ns=now_ns)
+        if answer == {"watch": True}:
+            client.watches = True
+        elif answer is not None:
+            self._say(client, answer)
+
+    def _say(self, client: Client, said: dict[str, Any]) -> None:
+        self._after(client, client.say(to_json(said)))
+
+    def _after(self, client: Client, fine: bool) -> None:
+        if not fine:
+            self._end(client)
+            return
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.waiting else 0)
+        key = self._selector.get_key(client.sock)
+        if key.events != wanted:
+            self._selector.modify(client.sock, wanted, key.data)
+
+    def _end(self, client: Client) -> None:
+        if self.clients.pop(client.number, None) is not None:
+            self._desk.pending.forget(client.number)
+            self._selector.unregister(client.sock)
+            client.sock.close()

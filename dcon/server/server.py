@@ -1,0 +1,293 @@
+"""The server's process: bundles in, log out (in a thread of its own), operators served, checks made beside the loop."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import selectors
+import socket
+from collections import deque
+from typing import Any
+
+from dcon.limiter import MW_PER_V
+from dcon.link import paths
+from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
+from dcon.link.keys import load_sequences, read_keys
+from dcon.link.orders import Verifier
+from dcon.link.paths import Sender
+from dcon.server import words
+from dcon.server.desk import Desk
+from dcon.server.newest import Newest, to_json
+from dcon.server.operators import Operators
+from dcon.server.recorder import MOST_PIECES, Recorder, Report
+from dcon.server.response import LineResponse, Response
+from dcon.server.scribe import Scribe
+from dcon.session.head import head_of
+from dcon.settings import Settings
+from pmutools.clock import Clock, SystemClock
+from pmutools.timebase import NS
+
+LOG = logging.getLogger(__name__)
+REPLIES = "server.replies"
+BEAT_NS = NS // 10
+NEWS_NS = NS // 2
+BREATH_NS = NS // 100
+SILENT_S = 2.0
+"""A disk that holds the log up for longer makes the server silent to the controller: nothing is recorded."""
+CONNECTIONS = 8
+"""Of controllers, at once: one is enough, but a new one may come before an old one is known to be gone."""
+BUNDLES_A_ROUND = 64
+"""Read from one connection before others have their turn."""
+READ_BYTES = LARGEST + 1
+
+
+class Server:
+    """Sockets are open once this is made. Raises SourceError where one cannot be had, or keys cannot be read."""
+
+    def __init__(self, settings: Settings, folder: str | os.PathLike[str], *, clock: Clock | None = None) -> None:
+        self.settings = settings
+        self.clock = clock or SystemClock()
+        self.folder = paths.prepare(folder)
+        self.stopping = False
+        keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
+        now_ns = self.clock.realtime_ns()
+        last = load_sequences(self.folder)
+        verifier = Verifier(
+            keys,
+            window_ns=round(settings.server.window_s * NS),
+            last=last,
+            floor_ns=now_ns if last is None else 0,
+        )
+        self.newest = Newest()
+        self.response = LineResponse()
+        self.report = Report()
+        self.malformed = 0
+        """Messages on the controller's socket that are no bundles."""
+        self._selector = selectors.DefaultSelector()
+        self._listener = paths.listen(self.folder, paths.SERVER)
+        self._replies = paths.bind_datagram(self.folder, REPLIES)
+        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
+        self._watchdog = Sender(self.folder / paths.WATCHDOG)
+        self._control = Sender(self.folder / paths.CONTROL)
+        self.desk = Desk(self.folder, keys, self.status, verifier)
+        self.desk.reply_to = str(self.folder / REPLIES)
+        self.operators = Operators(settings.server.listen, self.desk, self._selector)
+        self._connections: list[socket.socket] = []
+        self._source: socket.socket | None = None
+        """The connection whose session is being recorded."""
+        self._pieces: list[Bundle] = []
+        self._more: list[Entry] = []
+        self._lag_ns: int | None = None
+        self._found: Response | None = None
+        self._beats = 0
+        self._reports: deque[Report] = deque(maxlen=1)
+        self._acked: tuple[int | None, int] = (None, -1)
+        log = settings.log
+        recorder = Recorder(log.path, self.folder, max_mb=log.max_mb, max_minutes=log.max_minutes)
+        self._session, self._queued = recorder.resumes
+        self._scribe = Scribe(recorder, self._reports.append)
+
+    def run(self) -> None:
+        """Serve until :attr:`stopping`; then write what has come, and end the log."""
+        clock = self.clock
+        beat_ns = news_ns = clock.monotonic_ns()
+        try:
+            while not self.stopping:
+                now_ns = clock.monotonic_ns()
+                for key, events in self._selector.select(min(max(beat_ns - now_ns, 0) / 1e9, 0.05)):
+                    key.data(events, clock.monotonic_ns(), clock.realtime_ns())
+                now_ns = clock.monotonic_ns()
+                self._acknowledge()
+                self.operators.answer(self.desk.pending.expired(now_ns))
+                if not self._scribe.has_room:  # what waits to be read would wake us again and again
+                    clock.sleep_until(now_ns + BREATH_NS)
+                if now_ns >= beat_ns:
+                    beat_ns = now_ns + BEAT_NS
+                    self._beat(words.RUNNING)
+                if now_ns >= news_ns:
+                    news_ns = now_ns + NEWS_NS
+                    self._tell(now_ns)
+        finally:
+            self.close()
+
+    def status(self) -> dict[str, Any]:
+        """For operators."""
+        now_ns = self.clock.realtime_ns()
+        report = self.report
+        return {
+            "time_ns": now_ns,
+            "controller_connected": self._source is not None,
+            **self.newest.status(),
+            "log": {
+                "file": report.file,
+                "parts": report.parts,
+                "lag_s": (now_ns - report.tick_ns) / NS if report.tick_ns else None,
+                "waiting_bytes": self._scribe.waiting,
+                "gaps": report.gaps,
+                "unlogged_ticks": report.unlogged,
+                "refused": report.refused,
+                "disk_free_percent": report.disk_free_percent,
+                "hangs": self._hangs(),
+            },
+            "response": None if self._found is None else self._found._asdict(),
+            "clock_ms": None if self._lag_ns is None else self._lag_ns / 1e6,
+            "server": {
+                "clients": len(self.operators.clients),
+                "turned_away": self.operators.turned_away,
+                "orders_relayed": self.desk.relayed,
+                "orders_pending": len(self.desk.pending),
+                "malformed": self.malformed,
+                "undecodable": self.newest.undecodable,
+            },
+        }
+
+    def close(self) -> None:
+        self._beat(words.ENDING)
+        if not self._scribe.close():
+            LOG.error("the disk does not take the log; %d bytes are not written", self._scribe.waiting)
+        self._acknowledge()
+        self.operators.close()
+        self.desk.close()
+        for sock in self._connections:
+            sock.close()
+        self._watchdog.close()
+        self._control.close()
+        self._selector.close()
+        paths.release(self._listener)
+        paths.release(self._replies)
+
+    def _accept(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:
+            return
+        sock.setblocking(False)
+        if len(self._connections) >= CONNECTIONS:
+            self._end(next(each for each in self._connections if each is not self._source))
+        self._connections.append(sock)
+
+        def ready(_events: int, _now_ns: int, utc_ns: int) -> None:
+            self._receive(sock, utc_ns)
+
+        self._selector.register(sock, selectors.EVENT_READ, ready)
+        self._say(sock, {"session": self._session, "have": self._queued})
+
+    def _end(self, sock: socket.socket) -> None:
+        if sock in self._connections:
+            self._connections.remove(sock)
+            self._selector.unregister(sock)
+            sock.close()
+        if sock is self._source:
+            self._source = None
+
+    def _say(self, sock: socket.socket, said: dict[str, Any]) -> None:
+        try:
+            sock.send(json.dumps(said).encode())
+        except BlockingIOError:  # it does not read: the next word says it all again
+            pass
+        except OSError:
+            self._end(sock)
+
+    def _receive(self, sock: socket.socket, utc_ns: int) -> None:
+        for _ in range(BUNDLES_A_ROUND):
+            if not self._scribe.has_room or sock not in self._connections:
+                return
+            try:
+                data = sock.recv(READ_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self._end(sock)
+                return
+            bundle = decode(data)
+            if bundle is None:
+                self.malformed += 1
+                self._end(sock)
+                return
+            self._take(sock, bundle, len(data), utc_ns)
+
+    def _take(self, sock: socket.socket, bundle: Bundle, size: int, utc_ns: int) -> None:
+        if bundle.kind is Kind.HEAD:
+            self._head(sock, bundle)
+        elif bundle.session != self._session:
+            return
+        elif bundle.is_numbered:
+            if bundle.sequence <= self._queued:
+                return
+            if bundle.sequence != self._queued + 1:
+                self._more = []
+            self._queued = bundle.sequence
+        self._scribe.put(bundle, size)
+        if bundle.kind is Kind.MORE:
+            self._more += bundle.entries
+        elif bundle.kind is Kind.TICK:
+            whole = bundle._replace(entries=(*self._more, *bundle.entries))
+            self._more = []
+            self._look(whole, utc_ns)
+
+    def _head(self, sock: socket.socket, piece: Bundle) -> None:
+        """What the session is: of a session that is known too, for a server that was started again."""
+        if self._pieces and (piece.session != self._pieces[0].session or piece.entries[:1] == self._pieces[0].entries):
+            self._pieces = []
+        self._pieces.append(piece)
+        head = head_of(self._pieces)
+        if head is None:
+            del self._pieces[:-MOST_PIECES]
+            return
+        self._pieces = []
+        self._source = sock
+        if piece.session != self._session:
+            self._session, self._queued = piece.session, -1
+        if head != self.newest.head:
+            self._more = []
+            self.newest.begin(head)
+            self.response = LineResponse()
+
+    def _look(self, tick: Bundle, utc_ns: int) -> None:
+        news = self.newest.take(tick)
+        self._lag_ns = utc_ns - tick.tick_ns
+        if news.driven_v is not None:
+            self.response.command(tick.tick_ns, news.driven_v * MW_PER_V)
+        if news.line is not None:
+            self.response.line(*news.line)
+        self.operators.answer(self.desk.heard(news))
+
+    def _reply(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
+        try:
+            datagram = self._replies.recv(READ_BYTES)
+        except OSError:
+            return
+        self.operators.answer(self.desk.reply(datagram))
+
+    def _acknowledge(self) -> None:
+        if not self._reports:
+            return
+        self.report = report = self._reports.pop()
+        safe = (report.session, report.have)
+        if safe != self._acked and report.session == self._session and self._source is not None:
+            self._acked = safe
+            self._say(self._source, {"ack": report.have})
+
+    def _hangs(self) -> bool:
+        return self._scribe.hangs(SILENT_S)
+
+    def _beat(self, state: int) -> None:
+        self._beats += 1
+        self._watchdog.send(words.beat(self._beats, self.clock.monotonic_ns(), state))
+
+    def _tell(self, now_ns: int) -> None:
+        """News for the controller, none where the log hangs; and a status for who watches."""
+        self._found = found = self.response.estimate()
+        if not self._hangs():
+            news = {
+                "kind": "server",
+                "disk_free_percent": self.report.disk_free_percent,
+                "response_gain": None if found is None else found.gain,
+                "response_lag_ms": None if found is None else found.lag_ms,
+            }
+            self._control.send(json.dumps(news).encode())
+        self.operators.watched(to_json(self.status()) if self.operators.is_watched else b"", now_ns)

@@ -1,0 +1,79 @@
+"""What the recorder must know when it is started again: kept in the run folder, replaced whole after every flush.
+
+It is written after the log and before the acknowledgement, so that a kill at any instant leaves one of two things:
+entries in the log that the file does not speak of, which are cut off and sent again; or nothing amiss.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from pmutools.errors import SourceError
+
+FILE = "server.state"
+
+
+class State(NamedTuple):
+    session: int
+    """Number that the control process drew."""
+    key: str
+    """What the parts of the log have in common."""
+    path: str
+    """Of the first part."""
+    have: int
+    """Last sequence that is in the log, or counted as missing there."""
+    parts: tuple[str, ...] = ()
+    """Paths."""
+    size: int | None = None
+    """Bytes of the last part that hold what is spoken of; None where it is ended."""
+    configs: tuple[tuple[str, str, int], ...] = ()
+    """PMU, configuration frame in hexadecimal, when it came."""
+
+
+def load(folder: Path) -> State | None:
+    """None where there is none, or it is damaged."""
+    try:
+        values = json.loads((folder / FILE).read_bytes())
+        state = State(**values)
+        configs = tuple((str(name), bytes.fromhex(frame).hex(), int(at)) for name, frame, at in state.configs)
+        numbers = (state.session, state.have, 0 if state.size is None else state.size)
+        texts = (state.key, state.path)
+        if not (all(type(number) is int for number in numbers) and all(isinstance(text, str) for text in texts)):
+            return None
+        return state._replace(parts=tuple(map(str, state.parts)), configs=configs)
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def save(folder: Path, state: State) -> bool:
+    """Whether it could be."""
+    fresh = folder / f"{FILE}.new"
+    try:
+        fresh.write_text(json.dumps(state._asdict()))
+        os.replace(fresh, folder / FILE)
+    except OSError:
+        return False
+    return True
+
+
+def free_path(path: str | os.PathLike[str]) -> Path:
+    """``path``, or ``NAME-2``, ``NAME-3``, ...: the first that no session has, nor a part of one.
+
+    Raises SourceError where the folder cannot be looked into.
+    """
+    first = Path(path)
+    try:
+        there = {entry.name for entry in os.scandir(first.parent)}
+    except OSError as error:
+        raise SourceError(f"{first.parent}: {error.strerror}") from None
+    part = re.compile(rf"(.+)\.part\d+{re.escape(first.suffix)}")
+    there |= {f"{match[1]}{first.suffix}" for name in there if (match := part.fullmatch(name))}
+    number, free = 1, first
+    while free.name in there:
+        number += 1
+        free = first.with_name(f"{first.stem}-{number}{first.suffix}")
+    return free
