@@ -113,6 +113,7 @@ class GpsAide(Aide):
         self._sources = ClockSources(places)
         self._told: tuple[Verdict | None, bool] = None, False
         self._told_ns = 0
+        self._broken: Exception | None = None
         if self._source != "none":
             threading.Thread(target=self._ask, name="gps-questions", daemon=True).start()
 
@@ -120,13 +121,16 @@ class GpsAide(Aide):
         """Ask again and again; every answer is judged as it comes."""
         quality = ClockQuality()
         field = "gps" if self._source == "gpsd" else self._source
-        while not self._stopped.is_set():
-            if field == "auto":
-                quality = self._sources.ask(quality, self._stopped, self._judge)
-            else:
-                quality = self._sources.ask_one(field, ClockQuality(), Patience(PATIENCE_S, self._stopped))
-                self._judge(quality)
-            self._stopped.wait(ASK_S)
+        try:
+            while not self._stopped.is_set():
+                if field == "auto":
+                    quality = self._sources.ask(quality, self._stopped, self._judge)
+                else:
+                    quality = self._sources.ask_one(field, ClockQuality(), Patience(PATIENCE_S, self._stopped))
+                    self._judge(quality)
+                self._stopped.wait(ASK_S)
+        except Exception as error:  # the edge of this thread: the loop fails of it
+            self._broken = error
 
     def _judge(self, quality: ClockQuality) -> None:
         if not self._stopped.is_set():
@@ -134,6 +138,8 @@ class GpsAide(Aide):
 
     def round(self) -> None:
         self._stopped.wait(ROUND_S)
+        if self._broken is not None:
+            raise self._broken
         now_ns = time.monotonic_ns()
         verdict, age_s = self._lock.said(now_ns), self._lock.age_s(now_ns)
         if verdict is None or age_s is None:

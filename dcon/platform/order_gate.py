@@ -7,14 +7,18 @@ controller too, so that it is in the session log and replays.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dcon.core.values import Order
+from dcon.link.keys import SEQUENCES, load_sequences, save_sequences
 from dcon.link.orders import Operator, RefusalLog, Refused, Verifier, digest
-from dcon.platform import sequences
 from pmutools.timebase import NS
+
+LOG = logging.getLogger(__name__)
 
 
 class Passed(NamedTuple):
@@ -31,8 +35,10 @@ class OrderGate:
     """Verifies orders, remembers what was accepted in ``operators.seq``, and tells of what is refused."""
 
     def __init__(self, operators: Mapping[str, Operator], window_s: float, run_dir: Path, utc_ns: int) -> None:
-        self._file = run_dir / sequences.FILE
-        last, floor_ns = sequences.load(self._file, utc_ns)
+        """Where ``operators.seq`` is not there or damaged, nothing counts that was signed before ``utc_ns`` (now)."""
+        self._folder = run_dir
+        last = load_sequences(run_dir)
+        floor_ns = utc_ns if last is None else 0
         self.verifier = Verifier(operators, window_ns=round(window_s * NS), last=last, floor_ns=floor_ns)
         self._refusals = RefusalLog()
         self.accepted = self.refused = 0
@@ -61,7 +67,10 @@ class OrderGate:
             news = None if told is None else _order(told)
             return Passed(news, reply_to, {**reply, "accepted": False, "reason": found.reason})
         self.accepted += 1
-        sequences.save(self._file, self.verifier.last)
+        if not save_sequences(self._folder, self.verifier.last):
+            LOG.warning("%s: cannot be written", self._folder / SEQUENCES)
+            with suppress(OSError):  # better none than one that is behind
+                (self._folder / SEQUENCES).unlink()
         return Passed(_order(found.order), reply_to, reply)
 
 
