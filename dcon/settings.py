@@ -195,12 +195,10 @@ class Server:
 
     required: bool = field(default=False, metadata=parsed_by(boolean))
     """The server must be heard: without it no arming; a loss warns."""
-    listen: Endpoint = field(default=Endpoint(Scheme.TCP, "127.0.0.1", 4790), metadata=parsed_by(_listening))
-    """``HOST:PORT`` for operators. Orders are signed, what is told is not secret to who can connect."""
     keys: str | None = field(default=None, metadata=parsed_by(str))
-    """File of operators and their keys (``dcon keys``); without it nobody orders anything."""
+    """File of the operators' keys, which only its owner may read; without it nobody can order anything."""
     window_s: float = field(default=5.0, metadata=parsed_by(number(0.1, 60)))
-    """An order's time may differ so much from the platform's clock."""
+    """An order counts when its time is no further from now than this, either way."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """The demo's grid as a process of its own: it integrates in real time, sends eight PMUs, and takes the command.
 
 ``python -m dcon.demo.grid --start-ns N --command-port P --pmu-port P0 ...``; knows nothing of the controller but
-datagrams. What its PMUs send goes through the player's fault pipeline.
+datagrams. What its PMUs send goes through the player's fault pipeline. With ``--status-port`` it tells the status of
+the DC line ten times a second.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 import argparse
 import gc
 import heapq
+import socket
 import sys
+from contextlib import suppress
 
+from dcon.core.values import Pdci
 from dcon.demo.course import Course
-from dcon.drivers import udp_command
+from dcon.drivers import line_status, udp_command
 from pmutools import linux, timebase
 from pmutools.c37118.session import served
 from pmutools.clock import SystemClock, utc_offset
@@ -32,13 +36,25 @@ RATE = 60
 SILENCE_NS = 500_000_000
 """Without a command for so long the line goes back to its schedule."""
 SPIN_NS = 100_000
+SCHEDULED_MW = 2000.0
+"""Of the line, north to south: room for ±125 MW on either side."""
+STATUS_SLOTS = RATE // 10
+"""From one status of the line to the next."""
 
 
 class LiveGrid:
     """The grid, its PMUs on the wire, and its command input."""
 
     def __init__(
-        self, course: Course, start_ns: int, command_port: int, pmu_port: int, profile: str, noise_rad: float, seed: int
+        self,
+        course: Course,
+        start_ns: int,
+        command_port: int,
+        pmu_port: int,
+        profile: str,
+        noise_rad: float,
+        seed: int,
+        status_port: int | None = None,
     ) -> None:
         self.clock = SystemClock(spin_ns=SPIN_NS)
         self.grid = Grid(build("modal"), course.scenario, start_ns=start_ns, seed=seed)
@@ -60,6 +76,11 @@ class LiveGrid:
             self.pipelines.append(Pipeline(faults, pmu.name, seed, config=stream.config, aliases=names))
         self.last_sequence = -1
         self.last_command_ns = 0
+        self.status_to: socket.socket | None = None
+        if status_port is not None:
+            self.status_to = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self.status_to.setblocking(False)
+            self.status_to.connect(("127.0.0.1", status_port))
 
     def run(self) -> None:
         """From the start to the end of the course, in real time."""
@@ -78,6 +99,7 @@ class LiveGrid:
             if next_ns == stamp_ns:
                 self._silence(stamp_ns)
                 self.grid.advance(stamp_ns)
+                self._tell_status(slot, stamp_ns)
                 buses = self.grid.buses()
                 for number, (pmu, stream) in enumerate(zip(self.pmus, self.streams, strict=True)):
                     report = measure(pmu, buses, stamp_ns, slot)
@@ -108,6 +130,14 @@ class LiveGrid:
             self.last_command_ns = chunk.arrival_ns or command.time_ns
             self.grid.command(command.command_mw, self.last_command_ns)
 
+    def _tell_status(self, slot: int, now_ns: int) -> None:
+        """The schedule, and on it what has arrived of the command by now."""
+        if self.status_to is None or slot % STATUS_SLOTS:
+            return
+        line = Pdci(now_ns, SCHEDULED_MW + self.grid.command_mw, scheduled_mw=SCHEDULED_MW)
+        with suppress(OSError):  # nobody has to listen
+            self.status_to.send(line_status.encode(slot // STATUS_SLOTS, line))
+
     def _silence(self, now_ns: int) -> None:
         """The line goes back to its schedule, and the next to command may begin its sequence anew."""
         if self.last_sequence >= 0 and now_ns - self.last_command_ns > SILENCE_NS:
@@ -117,6 +147,8 @@ class LiveGrid:
     def close(self) -> None:
         self.senders.close()
         self.inbox.close()
+        if self.status_to is not None:
+            self.status_to.close()
 
 
 def main(arguments: list[str]) -> int:
@@ -129,6 +161,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--profile", required=True)
     parser.add_argument("--noise-rad", type=float, required=True)
     parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--status-port", type=int, help="Send the line's status (DCP1) to this port of loopback.")
     given = parser.parse_args(arguments)
     try:
         grid = LiveGrid(
@@ -139,6 +172,7 @@ def main(arguments: list[str]) -> int:
             given.profile,
             given.noise_rad,
             given.seed,
+            given.status_port,
         )
     except PmuError as error:
         sys.stderr.write(f"grid: {error}\n")

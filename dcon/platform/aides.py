@@ -31,6 +31,7 @@ from dcon.core.values import Pdci
 from dcon.drivers.line_status import LineOnModbus, StatusInbox
 from dcon.link import paths
 from dcon.link.beats import LoopName, LoopState
+from dcon.link.keys import read_keys
 from dcon.link.paths import Sender
 from dcon.places import LineSource, ModbusLine
 from dcon.platform.gps_lock import Lock, Verdict, judge
@@ -264,7 +265,8 @@ def aides(settings: Settings, run_dir: Path) -> list[Aide]:
 
 
 def _gate(settings: Settings, run_dir: Path) -> OrderGate:
-    return OrderGate({}, 5.0, run_dir, time.time_ns())
+    operators = {} if settings.server.keys is None else read_keys(settings.server.keys)
+    return OrderGate(operators, settings.server.window_s, run_dir, time.time_ns())
 
 
 def work(loops: list[Aide], stopping: Callable[[], bool]) -> str:

@@ -17,11 +17,13 @@ import pytest
 from support.live import free_udp_port
 
 from dcon.cli import dcon
+from dcon.core.values import Pdci
 from dcon.demo import conductor
 from dcon.demo.conductor import Demo, DemoError, free_ports, perform, phase, report
 from dcon.demo.course import BRAKE_S, Course
 from dcon.demo.grid import SILENCE_NS, LiveGrid
 from dcon.demo.judge import PAPER, judge, read_traces, summarise
+from dcon.drivers import line_status
 from dcon.drivers.udp_command import CommandOut, encode
 from dcon.sim.plan import START_NS, Plan
 from dcon.sim.simulate import simulate
@@ -188,6 +190,32 @@ def test_the_grid_takes_good_commands_in_sequence_and_forgets_a_silent_controlle
             grid.grid.advance(grid.last_command_ns + SILENCE_NS + NS)
             assert grid.grid.command_mw == 0.0
             assert applied(encode(CommandOut(0, 0, 10.0, 0.8))) == 10.0  # a controller that was started anew
+        finally:
+            grid.close()
+
+
+@pytest.mark.realtime
+def test_the_grid_tells_the_status_of_its_line() -> None:
+    """What has arrived of the command is on top of the schedule: not what was sent just now."""
+    port = free_udp_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5)
+        grid = LiveGrid(SHORT, START_NS, port, free_ports(8), "table1", 0.0, 1, listener.getsockname()[1])
+        try:
+            grid._tell_status(0, START_NS)
+            assert line_status.decode(listener.recv(100)) == (0, Pdci(START_NS, 2000.0, True, True, 2000.0))
+            grid.grid.command(-40.0, START_NS)
+            grid.grid.advance(START_NS + 10_000_000)
+            grid._tell_status(6, START_NS + 10_000_000)
+            grid.grid.advance(START_NS + 12_000_000)
+            for slot in range(7, 13):
+                grid._tell_status(slot, START_NS + 12_000_000)
+            told = [line_status.decode(listener.recv(100)) for _ in range(2)]
+            assert [status and (status.sequence, status.line.power_mw) for status in told] == [(1, 2000.0), (2, 1960.0)]
+            listener.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                listener.recv(100)
         finally:
             grid.close()
 

@@ -9,10 +9,11 @@ import pytest
 
 from dcon.cli import dcon
 from dcon.core.params import Pair, Params, Thresholds
-from dcon.effective import effective
-from dcon.settings import load, parse
+from dcon.places import IioPlace
+from dcon.settings import effective, load, parse
 from pmutools.cli.shell import run
 from pmutools.errors import SettingsError, SourceError
+from pmutools.net.endpoint import Endpoint
 
 GOOD = """\
 [DEFAULT]
@@ -74,6 +75,19 @@ def test_what_the_file_says_is_in_force() -> None:
     assert settings.text == GOOD
 
 
+def test_outputs_and_the_line_have_urls() -> None:
+    text = GOOD.replace(
+        "url = udp://192.0.2.30:4790", "url = iio:///sys/bus/iio/devices/iio:device0?readback=1\nhold_ms = 50"
+    )
+    settings = parse(text.replace("[pdci]", "[pdci]\nurl = udp://0.0.0.0:4791?source=192.0.2.31\nrequired = yes"), "x")
+    assert isinstance(settings.output.url, IioPlace) and settings.output.url.keys.readback == 1
+    assert settings.output.hold_ms == 50 and settings.params.line.required
+    assert isinstance(settings.line_input.url, Endpoint) and settings.line_input.url.source == "192.0.2.31"
+    assert ("pdci", "url", "udp://0.0.0.0:4791?source=192.0.2.31", "") in effective(settings)
+    assert ("platform", "time_source", "auto", "") in effective(settings)
+    assert parse(GOOD, "x").line_input.url is None
+
+
 def test_defaults_are_those_of_the_controller() -> None:
     text = "[pmu A]\nurl = udp://h:1\nside = north\n[pmu B]\nurl = udp://h:2\nside = south\n"
     settings = parse(text, "dcon.ini")
@@ -125,6 +139,32 @@ MISTAKES = {
         "[watchdog]\n[probing]\nlow_hz = 6",
         "dcon.ini:34: [probing] low_hz: 6: must be below high_hz = 5",
     ),
+    "an output without its device": (
+        "url = udp://192.0.2.30:4790",
+        "url = iio://device0",
+        "dcon.ini:35: [output] url: iio://device0: write three slashes and the device's folder",
+    ),
+    "an output with a register that there cannot be": (
+        "url = udp://192.0.2.30:4790",
+        "url = modbus://192.0.2.30?register=65536",
+        "dcon.ini:35: [output] url: modbus://192.0.2.30? register: 65536 is out of range; it must be 0 to 65535",
+    ),
+    "an output that is held for too long": (
+        "[output]",
+        "[output]\nhold_ms = 5000",
+        "dcon.ini:35: [output] hold_ms: 5000 is out of range; it must be 20 to 1000",
+    ),
+    "a source of the line's status that tells none": (
+        "[pdci]",
+        "[pdci]\nurl = tcp://192.0.2.31:4791",
+        "dcon.ini:37: [pdci] url: tcp://192.0.2.31:4791: the line's status comes by udp://HOST:PORT",
+    ),
+    "an unknown key of the line": ("[pdci]", "[pdci]\nrating = 1", "dcon.ini:37: [pdci] rating: unknown key; "),
+    "an unknown source of time": (
+        "phase_ms = 4.5",
+        "time_source = ntp",
+        "dcon.ini:31: [platform] time_source: 'ntp' is not one of auto, kernel, chrony, gpsd, ptp, none",
+    ),
     "a rating below nothing": ("[pdci]", "[pdci]\nrating_ns_mw = -1", "dcon.ini:37: [pdci] rating_ns_mw: -1 is out of"),
     "an unknown section": ("[log]", "[logg]", "dcon.ini:37: [logg]: unknown section; did you mean 'log'?"),
     "an unknown key of the controller": (
@@ -175,7 +215,7 @@ MISTAKES = {
     "an output that is no datagram": (
         "udp://192.0.2.30:4790",
         "tcp://192.0.2.30:4790",
-        "dcon.ini:35: [output] url: tcp://192.0.2.30:4790: commands leave as udp://HOST:PORT",
+        "dcon.ini:35: [output] url: tcp://192.0.2.30:4790: commands leave as udp://HOST:PORT, iio://FOLDER or",
     ),
     "an IDCODE that cannot be": ("idcode = 101", "idcode = 70000", "dcon.ini:7: [pmu N1] idcode: 70000 is out of"),
     "two IDCODEs": (

@@ -11,8 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dcon.drivers.driver import Driver
 from dcon.drivers.udp_command import MAGIC, SIZE, CommandOut, UdpCommandDriver, decode, encode
 from dcon.limiter import MW_PER_V
+from dcon.places import IioPlace
+from pmutools.errors import SettingsError
 from pmutools.net.endpoint import parse_endpoint
 
 LAYOUT = ">4sIqddI"
@@ -96,3 +99,24 @@ def test_a_receiver_that_comes_late_misses_no_more_than_its_absence(unheard: int
     driver.close()
     driver.send(11, 0.0)  # even on a closed socket nothing is raised
     assert driver.failed >= 1
+
+
+@pytest.mark.realtime
+def test_it_is_a_driver_that_reads_nothing_back_and_leaves_0_v(receiver: socket.socket) -> None:
+    driver: Driver = driver_to(receiver.getsockname()[1])
+    driver.drive(1, 4.0)
+    driver.drive(2, -4.0, 3)
+    driver.close()
+    got = [decode(receiver.recv(100)) for _ in range(3)]
+    assert [(command.sequence, command.output_v, command.flags) for command in got if command] == [
+        *((0, 4.0, 0), (1, -4.0, 3), (2, 0.0, 0))
+    ]
+    assert driver.readback() is None and not driver.reads_back and driver.trouble == ""
+    assert driver.driven >= 2
+
+
+def test_what_needs_a_process_of_its_own_is_not_driven_from_the_loop() -> None:
+    with pytest.raises(
+        SettingsError, match=r"^\[output\] iio:///x\?channel=0: driven by a process of its own, dcon output"
+    ):
+        UdpCommandDriver(IioPlace("/x"))
