@@ -22,6 +22,7 @@ def command(ini: str, run_dir: str, log: str | None, as_json: bool, quiet: bool,
     """
     from dataclasses import replace
 
+    from dcon.link.notify import Notifier
     from dcon.server.server import Server
     from dcon.settings import load
 
@@ -29,7 +30,7 @@ def command(ini: str, run_dir: str, log: str | None, as_json: bool, quiet: bool,
     settings = load(ini)
     if log is not None:
         settings = replace(settings, log=replace(settings.log, path=log))
-    server = Server(settings, run_dir)
+    server = Server(settings, run_dir, notifier=Notifier())
 
     def stop(signum: int, frame: FrameType | None) -> None:
         server.stopping = True

@@ -14,6 +14,7 @@ from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
 from dcon.link.keys import load_sequences, read_keys
+from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
 from dcon.server import words
@@ -45,11 +46,19 @@ READ_BYTES = LARGEST + 1
 class Server:
     """Sockets are open once this is made. Raises SourceError where one cannot be had, or keys cannot be read."""
 
-    def __init__(self, settings: Settings, folder: str | os.PathLike[str], *, clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        folder: str | os.PathLike[str],
+        *,
+        clock: Clock | None = None,
+        notifier: Notifier | None = None,
+    ) -> None:
         self.settings = settings
         self.clock = clock or SystemClock()
         self.folder = paths.prepare(folder)
         self.stopping = False
+        self._notifier = notifier or Notifier({})
         keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
         now_ns = self.clock.realtime_ns()
         last = load_sequences(self.folder)
@@ -93,6 +102,7 @@ class Server:
         """Serve until :attr:`stopping`; then write what has come, and end the log."""
         clock = self.clock
         beat_ns = news_ns = clock.monotonic_ns()
+        self._notifier.tell(READY)
         try:
             while not self.stopping:
                 now_ns = clock.monotonic_ns()
@@ -144,6 +154,7 @@ class Server:
         }
 
     def close(self) -> None:
+        self._notifier.tell(STOPPING)
         self._beat(words.ENDING)
         if not self._scribe.close():
             LOG.error("the disk does not take the log; %d bytes are not written", self._scribe.waiting)
@@ -290,4 +301,5 @@ class Server:
                 "response_lag_ms": None if found is None else found.lag_ms,
             }
             self._control.send(json.dumps(news).encode())
+            self._notifier.tell(ALIVE, status=f"{self.newest.ticks} ticks, {self.report.unlogged} missing")
         self.operators.watched(to_json(self.status()) if self.operators.is_watched else b"", now_ns)
