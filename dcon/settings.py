@@ -143,6 +143,8 @@ class Watchdog:
     """File for its lines (JSON); without one they go to stderr."""
     log_mb: float = field(default=10.0, metadata=parsed_by(number(0.01, 1e4)))
     """A log file of so many megabytes becomes ``FILE.1``, over the one before."""
+    status_timeout_ms: float = field(default=100.0, metadata=parsed_by(number(40, 5000)))
+    """The controller takes a watchdog that has said nothing for so long as dead, and trips."""
     fast_timeout_ms: float = _limit("fast_timeout_ms")
     """Longest time without a beat of control, udp and parse, or with beats whose counter stands."""
     slow_timeout_ms: float = _limit("slow_timeout_ms")

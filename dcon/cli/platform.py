@@ -103,25 +103,17 @@ def _session(
     from pmutools.clock import SystemClock
 
     clock = SystemClock(spin_ns=SPIN_NS)
-    ticked = _Herald(notifier)
     if folder is None:
         from dcon.platform.alone import own_ends
 
-        platform = Platform(settings, own_ends(settings, clock, log_path), clock, ticked=ticked)
-        with _stopped_by_signals(platform):
-            yield platform
-        return
-    from dcon.link.paths import prepare
-    from dcon.platform.linked import Linked
+        ends = own_ends(settings, clock, log_path)
+    else:
+        from dcon.link.paths import prepare
+        from dcon.platform.linked import Linked
 
-    linked = Linked(settings, ini, prepare(folder), clock)
-    platform = Platform(settings, linked.ends, clock, ticked=ticked)
+        ends = Linked(settings, ini, prepare(folder), clock).ends
+    platform = Platform(settings, ends, clock, ticked=_Herald(notifier))
     with _stopped_by_signals(platform):
-        try:
-            linked.wait(lambda: platform.stopping)
-        except BaseException:
-            linked.ends.close()
-            raise
         yield platform
 
 

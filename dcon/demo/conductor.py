@@ -7,23 +7,42 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dcon.demo.course import Course
 from dcon.demo.judge import read_traces, summarise
+from dcon.link.keys import add_key, read_keys
+from dcon.server.client import Client, order
 from dcon.sim.plan import ini_of
 from pmutools import timebase
 from pmutools.errors import PmuError, SourceError
 from pmutools.grid.pmu_model import fleet
+from pmutools.net.endpoint import Endpoint, Scheme
 
 LEAD_S = 3.0
-"""From the launch of the processes to second 0 of the course: they import and bind in that time."""
+"""From the launch of the grid to second 0 of the course: it imports and binds in that time."""
+READY_S = 60.0
+"""For the processes of the controller to find each other; some 3 s on a machine that has nothing else to do."""
 GRACE_S = 15.0
+END_S = 20.0
+"""For a process that was asked to end: it ramps down, and closes its log."""
+WHOLE = sys.platform == "linux"
+"""All processes of the platform; elsewhere the controller is alone, and its orders are given beforehand."""
+ENDED = 130
+"""Exit code of ``dcon run`` that was asked to end."""
+WHO = "demo"
+PATIENT = "\n".join(
+    f"{key} = 1000"
+    for key in ("status_timeout_ms", "fast_timeout_ms", "command_timeout_ms", "stamp_max_ms", "late_max_ms")
+)
+"""Of the watchdog: a desktop that does something else pauses for longer than a controller of a line may."""
 
 
 class DemoError(PmuError):
@@ -64,34 +83,86 @@ def free_ports(count: int) -> int:
     raise SourceError(f"no {count} consecutive free UDP ports on 127.0.0.1")
 
 
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where everything of one run is."""
+
+    ini: Path
+    work: Path
+    """Of files that are gone after the run: the operator's key, sockets, the watchdog's log."""
+    command_port: int
+    status_port: int
+    pmu_port: int
+    """Of the first PMU; the others follow."""
+    server_port: int
+
+    @property
+    def keys(self) -> Path:
+        return self.work / "keys.ini"
+
+    @property
+    def server(self) -> Endpoint:
+        return Endpoint(Scheme.TCP, "127.0.0.1", self.server_port)
+
+
 def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, seconds: None) -> dict[str, Any]:
     """Run the demo and leave ``session.mcap``, ``summary.json``, ``demo.png`` and ``dcon.ini`` in ``demo.out``.
 
     ``tell`` is given what is going on and the seconds from the start. Returns what :func:`report` does. Raises
     DemoError where a process fails, SourceError where the folder cannot be written.
     """
-    pmus, course = fleet(), demo.course
-    base = free_ports(len(pmus) + 1)
-    command_port, pmu_port = base, base + 1
-    ini = demo.out / "dcon.ini"
+    pmus = fleet()
+    base = free_ports(len(pmus) + 2)
     try:
         demo.out.mkdir(parents=True, exist_ok=True)
-        with _alone(demo.out):
-            ini.write_text(
+        with _alone(demo.out), tempfile.TemporaryDirectory(prefix="dcon-demo-") as work:
+            site = Site(demo.out / "dcon.ini", Path(work), base, base + 1, base + 2, free_tcp_port())
+            _clear(demo.log_path)
+            add_key(site.keys, WHO)
+            site.ini.write_text(
                 ini_of(
                     pmus,
                     gain_mw_per_mhz=demo.gain_mw_per_mhz,
                     deadband_mhz=0.0,
-                    init_s=course.init_s,
-                    urls=[f"udp://127.0.0.1:{pmu_port + number}" for number in range(len(pmus))],
-                    extra=f"\n[output]\nurl = udp://127.0.0.1:{command_port}\n",
+                    init_s=demo.course.init_s,
+                    urls=[f"udp://127.0.0.1:{site.pmu_port + number}" for number in range(len(pmus))],
+                    extra=_extra(demo, site),
                 )
             )
-            return _perform(demo, ini, command_port, pmu_port, tell)
+            return _perform(demo, site, tell)
     except PmuError:
         raise
     except OSError as error:
         raise SourceError(f"--out {demo.out}: {error.strerror}") from None
+
+
+def _clear(path: Path) -> None:
+    """Take away the log of a demo before: a server writes beside a log, never over it."""
+    for part in (path, *path.parent.glob(f"{path.stem}.part*{path.suffix}")):
+        part.unlink(missing_ok=True)
+
+
+def _extra(demo: Demo, site: Site) -> str:
+    """The rest of the initialisation file."""
+    output = f"\n[output]\nurl = udp://127.0.0.1:{site.command_port}\n"
+    if not WHOLE:
+        return output
+    return output + "\n".join(
+        (
+            f"[pdci]\nurl = udp://127.0.0.1:{site.status_port}",
+            f"[watchdog]\nrequired = yes\nlog = {site.work / 'watchdog.jsonl'}\n{PATIENT}",
+            f"[server]\nrequired = yes\nlisten = 127.0.0.1:{site.server_port}\nkeys = {site.keys}",
+            f"[log]\npath = {demo.log_path.absolute()}",
+            "",
+        )
+    )
+
+
+def free_tcp_port() -> int:
+    """A TCP port that is free now on loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 @contextmanager
@@ -113,16 +184,17 @@ def _alone(folder: Path) -> Iterator[None]:
         os.close(held)
 
 
-def _perform(
-    demo: Demo, ini: Path, command_port: int, pmu_port: int, tell: Callable[[str, float], None]
-) -> dict[str, Any]:
+def _perform(demo: Demo, site: Site, tell: Callable[[str, float], None]) -> dict[str, Any]:
     course = demo.course
-    start_ns = (time.time_ns() // timebase.NS + 1) * timebase.NS + round(LEAD_S * timebase.NS)
     processes: dict[str, subprocess.Popen[str]] = {}
     try:
-        processes["controller"] = _launch(_controller(demo, ini, start_ns))
-        processes["grid"] = _launch(_grid(demo, start_ns, command_port, pmu_port))
-        _wait(processes, start_ns, course, tell)
+        start_ns = _second_zero()
+        processes["controller"] = _launch(_controller(demo, site, start_ns))
+        if WHOLE:
+            _await_controller(processes["controller"], site)
+            start_ns = _second_zero()
+        processes["grid"] = _launch(_grid(demo, site, start_ns))
+        _wait(processes, start_ns, course, tell, _operator(site) if WHOLE else None)
     finally:
         for process in processes.values():
             if process.poll() is None:
@@ -131,6 +203,35 @@ def _perform(
             _reap(process)
     tell("reading the session log", course.end_s)
     return report(demo, start_ns)
+
+
+def _second_zero() -> int:
+    return (time.time_ns() // timebase.NS + 1) * timebase.NS + round(LEAD_S * timebase.NS)
+
+
+def _await_controller(process: subprocess.Popen[str], site: Site) -> None:
+    """Until the server has heard a tick; raises DemoError where that does not happen."""
+    end_s = time.monotonic() + READY_S
+    while time.monotonic() < end_s:
+        if process.poll() is not None:
+            raise DemoError(f"the controller process failed: {_last_words(process)}")
+        with suppress(SourceError), Client(site.server) as client:
+            if client.ask({"ask": "status"})["state"] is not None:
+                return
+        time.sleep(0.1)
+    raise DemoError(f"the controller is not ready after {READY_S:g} s; is the machine overloaded?")
+
+
+def _operator(site: Site) -> Callable[[str], None]:
+    """Who gives an order, and wants to hear that it was taken."""
+    key = read_keys(site.keys)[WHO]
+
+    def give(name: str) -> None:
+        answer = order(site.server, key, name, why="the demo's course", now_ns=time.time_ns())
+        if "accepted" not in answer:
+            raise DemoError(f"{name} was not accepted: {answer.get('refused') or answer}")
+
+    return give
 
 
 def report(demo: Demo, start_ns: int) -> dict[str, Any]:
@@ -153,19 +254,23 @@ def report(demo: Demo, start_ns: int) -> dict[str, Any]:
     return summary
 
 
-def _controller(demo: Demo, ini: Path, start_ns: int) -> list[str]:
-    orders = [f"{order.at_ns / 1e9:g}:{order.order.name}" for order in demo.course.orders]
+def _controller(demo: Demo, site: Site, start_ns: int) -> list[str]:
+    """With all its processes it runs until it is told to end; alone it is told everything now."""
+    if WHOLE:
+        return [*("-m", "dcon.cli", "run", "--quiet", "--ini", str(site.ini), "--run-dir", str(site.work / "run"))]
+    orders = [f"{timed.at_ns / 1e9:g}:{timed.order.name}" for timed in demo.course.orders]
     return [
-        *("-m", "dcon.cli", "platform", "--quiet", "--ini", str(ini), "--log", str(demo.log_path)),
+        *("-m", "dcon.cli", "platform", "--quiet", "--ini", str(site.ini), "--log", str(demo.log_path)),
         *("--start", timebase.format_utc(start_ns), "--duration", f"{demo.course.end_s:g}"),
         *(word for order in orders for word in ("--order", order)),
     ]
 
 
-def _grid(demo: Demo, start_ns: int, command_port: int, pmu_port: int) -> list[str]:
+def _grid(demo: Demo, site: Site, start_ns: int) -> list[str]:
     return [
         *("-m", "dcon.demo.grid", "--start-ns", str(start_ns)),
-        *("--command-port", str(command_port), "--pmu-port", str(pmu_port)),
+        *("--command-port", str(site.command_port), "--pmu-port", str(site.pmu_port)),
+        *("--status-port", str(site.status_port)),
         *("--open-loop-s", repr(demo.course.open_loop_s), "--swing-s", repr(demo.course.swing_s)),
         *("--profile", demo.profile, "--noise-rad", repr(demo.noise_rad), "--seed", str(demo.seed)),
     ]
@@ -177,14 +282,18 @@ def _launch(arguments: list[str]) -> subprocess.Popen[str]:
 
 
 def _wait(
-    processes: dict[str, subprocess.Popen[str]], start_ns: int, course: Course, tell: Callable[[str, float], None]
+    processes: dict[str, subprocess.Popen[str]],
+    start_ns: int,
+    course: Course,
+    tell: Callable[[str, float], None],
+    give: Callable[[str], None] | None,
 ) -> None:
+    """Until all have ended; ``give`` is called with the course's orders as their times come."""
     said = ""
     deadline_ns = start_ns + round((course.end_s + GRACE_S) * timebase.NS)
+    orders = deque(course.orders if give is not None else ())
     while any(process.poll() is None for process in processes.values()):
-        for name, process in processes.items():
-            if process.poll():
-                raise DemoError(f"the {name} process failed: {_last_words(process)}")
+        _check(processes)
         now_ns = time.time_ns()
         if now_ns > deadline_ns:
             raise DemoError("the processes did not end in time; is the machine overloaded?")
@@ -193,9 +302,20 @@ def _wait(
         if text != said:
             said = text
             tell(text, seconds)
-        time.sleep(0.1)
+        if give is not None and not orders and seconds >= course.end_s:
+            give = None
+            processes["controller"].terminate()
+        if give is not None and orders and now_ns - start_ns >= orders[0].at_ns:
+            give(orders.popleft().order.name)
+            continue
+        time.sleep(0.02)
+    _check(processes)
+
+
+def _check(processes: dict[str, subprocess.Popen[str]]) -> None:
+    """Raises DemoError where one has failed."""
     for name, process in processes.items():
-        if process.returncode:
+        if process.poll() not in (None, 0, ENDED if name == "controller" and WHOLE else 0):
             raise DemoError(f"the {name} process failed: {_last_words(process)}")
 
 
@@ -220,7 +340,7 @@ def _last_words(process: subprocess.Popen[str]) -> str:
 
 def _reap(process: subprocess.Popen[str]) -> None:
     try:
-        process.wait(5)
+        process.wait(END_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

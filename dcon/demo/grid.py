@@ -8,7 +8,6 @@ the DC line ten times a second.
 from __future__ import annotations
 
 import argparse
-import gc
 import heapq
 import socket
 import sys
@@ -17,7 +16,7 @@ from contextlib import suppress
 from dcon.core.values import Pdci
 from dcon.demo.course import Course
 from dcon.drivers import line_status, udp_command
-from pmutools import linux, timebase
+from pmutools import timebase
 from pmutools.c37118.session import served
 from pmutools.clock import SystemClock, utc_offset
 from pmutools.errors import PmuError
@@ -31,11 +30,14 @@ from pmutools.impair.profiles import load_profile
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.server import Senders
 from pmutools.net.udp import UdpSocket
+from pmutools.realtime import go_realtime
 
 RATE = 60
 SILENCE_NS = 500_000_000
 """Without a command for so long the line goes back to its schedule."""
 SPIN_NS = 100_000
+PRIORITY = 5
+"""Where the system permits it: a grid keeps its time whatever else a machine does. Below the controller's."""
 SCHEDULED_MW = 2000.0
 """Of the line, north to south: room for ±125 MW on either side."""
 STATUS_SLOTS = RATE // 10
@@ -84,9 +86,7 @@ class LiveGrid:
 
     def run(self) -> None:
         """From the start to the end of the course, in real time."""
-        gc.collect()
-        gc.freeze()
-        linux.timer_slack()
+        go_realtime(fifo=True, priority=PRIORITY)
         offset = utc_offset(self.clock)
         self.senders.announce()
         due: list[tuple[int, int, int, bytes]] = []

@@ -117,10 +117,10 @@ class WatchdogCommand:
 class RunNews:
     """``control.in``, and whether the processes that this one has started are there still."""
 
-    def __init__(self, sock: socket.socket, children: Children, command: WatchdogCommand, clock: Clock) -> None:
+    def __init__(self, sock: socket.socket, children: Children, command: WatchdogCommand, heard: Heard) -> None:
         self._sock, self._children, self._command = sock, children, command
         self._orders: list[Order] = []
-        self.heard = Heard(clock.monotonic_ns())
+        self.heard = heard
 
     def listen(self, now_ns: int) -> None:
         """Take what there is."""
@@ -211,12 +211,14 @@ class Linked:
         self._children = Children()
         ours, theirs = pair()
         self._frames = PairFrames(ours, clock)
-        self._news = RunNews(inbox, self._children, command, clock)
+        heard = Heard(clock.monotonic_ns(), round(settings.watchdog.status_timeout_ms * 1e6))
+        self._news = RunNews(inbox, self._children, command, heard)
         self.ends = Ends(
             self._frames,
             lambda head: ShippedLog(head, settings, folder / paths.SERVER, self._news, clock),
             command,
             self._news,
+            self._wait,
         )
         here = ("--ini", str(ini), "--run-dir", str(folder))
         try:
@@ -228,7 +230,7 @@ class Linked:
             self.ends.close()
             raise
 
-    def wait(self, stopping: Callable[[], bool]) -> None:
+    def _wait(self, stopping: Callable[[], bool]) -> None:
         """Drive 0 V and beat until the watchdog finds everybody well, so that the first tick finds it healthy.
 
         Where that takes too long the session begins without, and shows it. Raises SourceError where the front or the

@@ -142,17 +142,9 @@ class Platform:
         prepare(fifo=settings.platform.fifo)
         log: Log | None = None
         try:
-            head = Head(
-                settings.text,
-                tuple(site.name for site in settings.sites),
-                settings.params.instance_names,
-                CORE.names,
-                {"start_ns": str(start_ns)},
-                settings.probe_file,
-            )
-            limits = settings.log
-            with RollingWriter(log_path, head, max_mb=limits.max_mb, max_minutes=limits.max_minutes) as writer:
-                self._loop(writer, OrderBook(orders, start_ns), end_ns)
+            log = self.ends.open_log(head)
+            self.ends.wait(lambda: self.stopping)
+            self._loop(log, OrderBook(orders, start_ns), end_ns)
         finally:
             gc.unfreeze()
             self.ends.command.send(self.clock.realtime_ns(), 0.0)

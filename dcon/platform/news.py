@@ -14,8 +14,6 @@ from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
 from dcon.session.codec import Watchdog
 
-STATUS_NS = 100_000_000
-"""A watchdog that has said nothing for so long is not healthy."""
 GPS_NS = 3_000_000_000
 """A lock that nobody has spoken of for so long is getting old."""
 SERVER_NS = 3_000_000_000
@@ -32,9 +30,12 @@ class Server(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The newest of every kind, each with the monotonic time at which it was heard (0: the start)."""
+    """The newest of every kind, each with the monotonic time at which it was heard."""
 
     started_ns: int
+    """When this began to listen."""
+    patience_ns: int = 100_000_000
+    """A watchdog that has said nothing for so long is not healthy."""
     gps_age_s: float | None = None
     gps_ns: int = 0
     status: WatchdogStatus | None = None
@@ -139,7 +140,7 @@ def watchdog_of(heard: Heard, time_ns: int) -> Watchdog | None:
 def is_healthy(heard: Heard, now_ns: int) -> bool:
     """Whether the watchdog lives, has not tripped, and would close its relays."""
     status = heard.status
-    if status is None or now_ns - status.monotonic_ns > STATUS_NS:
+    if status is None or now_ns - status.monotonic_ns > heard.patience_ns:
         return False
     return status.healthy and status.state is not WatchdogState.TRIPPED
 

@@ -119,6 +119,8 @@ class Ends:
     """Raises SourceError where it cannot be begun."""
     command: Command = field(default_factory=Nowhere)
     news: News = field(default_factory=Quiet)
+    wait: Callable[[Callable[[], bool]], object] = lambda stopping: None
+    """Called before the first tick, with what tells whether the end was asked for: until the others are there."""
 
     def close(self) -> None:
         for end in (self.command, self.news, self.frames):

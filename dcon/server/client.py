@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
+from dcon.link.orders import Operator, SignedOrder, sign
 from dcon.server.pending import PATIENCE_NS
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, join_host
@@ -16,6 +17,19 @@ from pmutools.timebase import NS
 CONNECT_S = 3.0
 ANSWER_S = PATIENCE_NS / NS + 3.0
 LONGEST_ANSWER = 1 << 20
+
+
+def order(
+    where: Endpoint, by: Operator, name: str, *, value: float = 0.0, text: str = "", why: str = "", now_ns: int
+) -> dict[str, Any]:
+    """Sign an order and await what becomes of it: ``{"accepted", "state"}``, or ``{"refused"}`` with the reason.
+
+    ``now_ns`` (POSIX UTC) is its time and its sequence. Raises SourceError as :class:`Client` does, ValueError for what
+    is no order.
+    """
+    signed = sign(SignedOrder(by.name, now_ns, now_ns, name, value, text, why), by.key)
+    with Client(where) as client:
+        return client.ask({"signed": signed.decode()})
 
 
 class Client:

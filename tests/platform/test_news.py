@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, encode_readback
-from dcon.platform.news import GPS_NS, SERVER_NS, STATUS_NS, Heard, hear, is_healthy, surroundings, watchdog_of
+from dcon.platform.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, surroundings, watchdog_of
 from dcon.session.codec import Watchdog
 from dcon.watchdog.codec import encode_status
 
 T0 = 10**12
+STATUS_NS = 100_000_000
 MS, S = 10**6, 10**9
 
 
