@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from generate import api, commands, controller, impairments, live, matrix, measures, player, streams, structure, studies
+from generate import (
+    api,
+    commands,
+    controller,
+    impairments,
+    live,
+    matrix,
+    measures,
+    player,
+    streams,
+    structure,
+    studies,
+    trials,
+)
 
 GENERATORS: dict[str, Callable[[], str]] = {
     **structure.GENERATORS,
@@ -16,6 +29,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     **matrix.GENERATORS,
     **measures.GENERATORS,
     **studies.GENERATORS,
+    **trials.GENERATORS,
     **commands.GENERATORS,
     **api.GENERATORS,
 }

@@ -1,0 +1,298 @@
+"""``dcon run`` on loopback: its processes, PMUs from ``pmu play``, a gateway that takes the command, an operator."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from support.emulator import Gateway
+from support.live import free_ports
+from support.swing import MS, Streams
+
+from dcon.core.values import Pdci
+from dcon.drivers import line_status
+from dcon.link import paths
+from dcon.link.keys import add_key, read_keys
+from dcon.server.client import Client, order
+from pmutools.c37118.config import encode_config
+from pmutools.errors import SourceError
+from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.timebase import NS
+
+ROOT = Path(__file__).parents[2]
+NAMES = ("N1", "S1")
+PATIENCE_S = 30.0
+LENGTH_S = 20
+"""Of the recording that is played over and over: a whole number of swings."""
+PROCESSES = {
+    "watchdog": "dcon.watchdog",
+    "server": "dcon.cli server",
+    "platform": "dcon.cli platform",
+    "front": "dcon.platform.front",
+    "aides": "dcon.platform.aides",
+}
+"""What is on the command line of each."""
+
+
+def recording(path: Path, names: tuple[str, ...] = NAMES) -> Path:
+    """Some PMUs in a steady swing, as raw bytes; played in a loop, its end fits its beginning."""
+    streams = Streams(names)
+    with path.open("wb") as file:
+        for name in names:
+            file.write(encode_config(streams.configs[name]))
+        for slot in range(LENGTH_S * 60):
+            for name in names:
+                file.write(streams.data(name, streams.stamp_ns(slot)))
+    return path
+
+
+class Around(threading.Thread):
+    """What the aides would be told by the site: the clock's lock, ten times a second, and the line's status."""
+
+    def __init__(self, run_dir: Path, line_port: int) -> None:
+        super().__init__(daemon=True)
+        self.gps_age_s = 0.0
+        self.in_service = True
+        self._control, self._line = paths.Sender(run_dir / paths.CONTROL), ("127.0.0.1", line_port)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._over = threading.Event()
+
+    def run(self) -> None:
+        number = 0
+        while not self._over.wait(0.1):
+            number += 1
+            news = {"kind": "gps", "age_s": self.gps_age_s, "source": "test", "detail": ""}
+            self._control.send(json.dumps(news).encode())
+            line = Pdci(time.time_ns(), 2000.0, self.in_service, True, 2000.0)
+            with suppress(OSError):
+                self._sock.sendto(line_status.encode(number, line), self._line)
+
+    def close(self) -> None:
+        self._over.set()
+        self.join()
+        self._sock.close()
+
+
+class Running:
+    """One ``dcon run`` with all that is around it."""
+
+    def __init__(self, folder: Path, extra: str = "") -> None:
+        self.folder = folder
+        self.run_dir = folder / "run"
+        self.keys = folder / "keys.ini"
+        *self.ports, line_port, self.server_port = free_ports(len(NAMES) + 2)
+        self.gateway = Gateway()
+        self.server = Endpoint(Scheme.TCP, "127.0.0.1", self.server_port)
+        add_key(self.keys, "ann")
+        self.operator = read_keys(self.keys)["ann"]
+        urls = [f"udp://127.0.0.1:{port}?source=127.0.0.1" for port in self.ports]
+        self.ini = folder / "site.ini"
+        settings = f"""
+[output]
+url = udp://127.0.0.1:{self.gateway.port}
+[platform]
+time_source = none
+gps_required = yes
+[supervisor]
+gps_holdover_s = 0.5
+[pdci]
+required = yes
+url = udp://127.0.0.1:{line_port}
+[watchdog]
+required = yes
+log = {self.watchdog_log}
+[server]
+required = yes
+listen = 127.0.0.1:{self.server_port}
+keys = {self.keys}
+[log]
+path = {self.log}
+{extra}"""
+        self.ini.write_text(Streams(NAMES).ini(urls=urls, extra=settings))
+        self.around = Around(self.run_dir, line_port)
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.run: subprocess.Popen[bytes] | None = None
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "session.mcap"
+
+    @property
+    def watchdog_log(self) -> Path:
+        return self.folder / "watchdog.jsonl"
+
+    # --- starting and ending
+
+    def start(self, *arguments: str) -> None:
+        played = recording(self.folder / "swing.c37118")
+        to = [
+            word
+            for name, port in zip(NAMES, self.ports, strict=True)
+            for word in ("--to", f"udp://127.0.0.1:{port}?idcode={Streams((name,)).configs[name].idcode}")
+        ]
+        delayed = ("--delay", "normal(60,1)")
+        self._start("pmutools.cli", "play", str(played), *to, *delayed, "--loop", "0", "--cfg-period", "1", "--quiet")
+        self.gateway.start()
+        self.around.start()
+        self.run = self._start("dcon.cli", "run", "--ini", str(self.ini), "--run-dir", str(self.run_dir), *arguments)
+
+    def _start(self, module: str, *words: str) -> subprocess.Popen[bytes]:
+        with (self.folder / "stderr").open("ab") as said:
+            process = subprocess.Popen([sys.executable, "-m", module, *words], stdout=subprocess.DEVNULL, stderr=said)
+        self._processes.append(process)
+        return process
+
+    def end(self) -> int:
+        """Ask ``dcon run`` to end; its exit code."""
+        assert self.run is not None
+        self.run.terminate()
+        code = self.run.wait(PATIENCE_S)
+        self.close()
+        return code
+
+    def close(self) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait(5)
+        if self.around.is_alive():
+            self.around.close()
+        if self.gateway.is_alive():
+            self.gateway.close()
+
+    # --- looking
+
+    def said(self) -> str:
+        """All that the processes wrote to stderr."""
+        return (self.folder / "stderr").read_text(errors="replace")
+
+    def status(self) -> dict[str, Any]:
+        with Client(self.server) as client:
+            return client.ask({"ask": "status"})
+
+    def until(self, holds: Callable[[dict[str, Any]], bool], what: str = "") -> dict[str, Any]:
+        """The status, once ``holds``; fails where that takes too long, or ``dcon run`` has ended."""
+        end_s = time.monotonic() + PATIENCE_S
+        status: dict[str, Any] = {}
+        while time.monotonic() < end_s:
+            assert self.run is not None and self.run.poll() is None, self.said()
+            with suppress(SourceError):
+                status = self.status()
+                if holds(status):
+                    return status
+            time.sleep(0.05)
+        raise AssertionError(f"never came true: {what}; {status}; {self.said()}")
+
+    def in_state(self, *states: str) -> dict[str, Any]:
+        """The status once the controller that is connected now is in one of ``states``."""
+        return self.until(lambda now: now["controller_connected"] and now["state"] in states, f"in {states}")
+
+    def watchdog_events(self) -> list[dict[str, Any]]:
+        lines = self.watchdog_log.read_text().splitlines() if self.watchdog_log.exists() else []
+        return [json.loads(line) for line in lines if line.endswith("}")]
+
+    def pid(self, name: str) -> int:
+        """Of a process, by what it is; it must be there."""
+        assert self.run is not None
+        found = [pid for pid in descendants(self.run.pid) if PROCESSES[name] in command_line(pid)]
+        assert len(found) == 1, (name, found)
+        return found[0]
+
+    def kill(self, name: str, number: signal.Signals = signal.SIGKILL) -> int:
+        """Send a signal; the monotonic time of that, ns."""
+        pid = self.pid(name)
+        at_ns = time.monotonic_ns()
+        os.kill(pid, number)
+        return at_ns
+
+    # --- ordering
+
+    def order(self, name: str, **given: Any) -> dict[str, Any]:
+        return order(self.server, self.operator, name, now_ns=time.time_ns(), **given)
+
+    def obeyed(self, name: str, **given: Any) -> None:
+        """An order that must be taken; one that comes too early for its permissives is given again."""
+        end_s = time.monotonic() + PATIENCE_S
+        answer: dict[str, Any] = {}
+        while time.monotonic() < end_s:
+            with suppress(SourceError):
+                answer = self.order(name, **given)
+                if "accepted" in answer:
+                    return
+            time.sleep(0.1)
+        raise AssertionError(f"{name}: {answer}; {self.status()['flags']}; {self.said()}")
+
+    def activate(self) -> None:
+        """From wherever it is: ACTIVE in closed loop, with closed relays."""
+        state = self.in_state("STANDBY", "ACTIVE", "FAULT", "ESTOP")["state"]
+        if state == "ACTIVE":
+            return
+        self.obeyed("release")
+        self.obeyed("reset") if state in ("FAULT", "ESTOP") else self.order("reset")
+        self.in_state("STANDBY")
+        self.order("ack")
+        self.obeyed("closed_loop")
+        self.obeyed("arm")
+        self.obeyed("activate")
+        self.until(lambda now: now["state"] == "ACTIVE" and abs(now["output_v"]) > 0.5, "a command")
+
+
+def descendants(pid: int) -> Iterator[int]:
+    """Children, and theirs; of all threads."""
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for word in (task / "children").read_text().split():
+                yield int(word)
+                yield from descendants(int(word))
+
+
+def command_line(pid: int) -> str:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    return ""
+
+
+FLOOD = """
+import socket, sys, time
+port, seconds, source, per_s = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3], 10_000
+datagrams = [bytes.fromhex(word) for word in sys.stdin.read().split()]
+sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+sock.bind((source, 0))
+begun, sent = time.monotonic(), 0
+while (passed := time.monotonic() - begun) < seconds:
+    while sent < passed * per_s:
+        sock.sendto(datagrams[sent % len(datagrams)], ("127.0.0.1", port))
+        sent += 1
+    time.sleep(0.001)
+print(sent)
+"""
+
+
+@contextmanager
+def flood(port: int, datagrams: list[bytes], seconds: float, source: str = "127.0.0.1") -> Iterator[None]:
+    """Ten thousand datagrams a second from a process of its own; checks at the end that they were as many."""
+    arguments = [sys.executable, "-c", FLOOD, str(port), str(seconds), source]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None and process.stdout is not None
+        process.stdin.write(" ".join(data.hex() for data in datagrams))
+        process.stdin.close()
+        yield
+        sent = int(process.stdout.read())
+    assert sent >= 9_000 * seconds
+
+
+def frames_now(name: str, count: int = 100) -> list[bytes]:
+    """Good data frames of a PMU with stamps from now on, 1/60 s apart."""
+    streams = Streams((name,))
+    now_ns = time.time_ns()
+    return [streams.data(name, now_ns + k * NS // 60 - 40 * MS) for k in range(count)]
