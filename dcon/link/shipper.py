@@ -117,28 +117,28 @@ class Shipper:
             have = said.get("ack", said.get("have"))
         except (ValueError, AttributeError):
             return
-        if not isinstance(have, int) or have >= self.ring.next:
+        if not isinstance(have, int):
             return
         if "ack" in said:
             if self._next is not None and have < self._next:
                 self.ring.acknowledge(have)
             return
-        if said.get("session") != self.session:
+        if said.get("session") != self.session or have >= self.ring.next:
             have = -1
-        self._next = max(have + 1, self.ring.first)
-        known = [frame for at, frame in self._configs.values() if at < self._next]
-        self._first = deque((*self._head, *known))
+        self._next = 0
+        self._first = deque(self._head)
+        self._skip(have + 1)
 
     def service(self, send: Callable[[bytes], bool], most: int = BUNDLES_A_CALL) -> int:
         """Give at most ``most`` bundles to ``send`` (false: not now, and no more this time); how many it took."""
         if self._next is None:
             return 0
+        self._skip(self.ring.first)
         taken = 0
         while taken < most:
             if self._first:
                 data: bytes | None = self._first[0]
             else:
-                self._next = max(self._next, self.ring.first)
                 data = self.ring.at(self._next)
             if data is None or not send(data):
                 break
@@ -149,6 +149,12 @@ class Shipper:
                 self._next += 1
         self.sent += taken
         return taken
+
+    def _skip(self, to: int) -> None:
+        """Go on at ``to`` or what is kept after it; configurations that are passed over are repeated."""
+        assert self._next is not None
+        before, self._next = self._next, max(self._next, to, self.ring.first)
+        self._first += [frame for at, frame in self._configs.values() if before <= at < self._next]
 
     def _push(self, kind: Kind, tick_ns: int, entries: tuple[Entry, ...], now_ns: int) -> bytes:
         data = encode(Bundle(kind, self.ring.next, self.session, tick_ns, entries))

@@ -42,7 +42,7 @@ class FakeControl:
     """Ships tick after tick; ``ring`` bounds what it keeps."""
 
     def __init__(self, folder: Path, session: int = 7, ring: Ring | None = None) -> None:
-        self.shipper = Shipper(session, HEAD.pieces(session), ring or Ring(600 * NS, 64 << 20))
+        self.shipper = Shipper(session, HEAD.pieces(session), Ring(600 * NS, 64 << 20) if ring is None else ring)
         self.shipping = Shipping(folder / SERVER, self.shipper)
         self.ticks = 0
         for name, frame in CONFIGS.items():

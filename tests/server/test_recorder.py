@@ -1,0 +1,270 @@
+"""The recorder: whatever dies, the log is whole as far as was said, and what is missing is counted."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+from support.sessions import CONFIGS, HEAD, T0
+from support.shipped import FakeControl, recorder_in, same_ticks, tick_at
+
+from dcon.link.bundle import Bundle, Entry, Kind, decode
+from dcon.link.shipper import Ring
+from dcon.server import state
+from dcon.server.recorder import Recorder
+from dcon.session.log import SessionReader
+from pmutools.cli.shell import run
+from pmutools.timebase import NS
+
+
+class Line:
+    """A control process and a recorder without sockets between them."""
+
+    def __init__(self, folder: Path, session: int = 7, ring: Ring | None = None, **limits: float) -> None:
+        self.folder = folder
+        self.limits = limits
+        self.control = FakeControl(folder / "run", session, ring)
+        self.recorder = recorder_in(folder, **limits)
+        self.connect()
+
+    def connect(self) -> None:
+        session, have = self.recorder.resumes
+        self.control.shipper.lost()
+        self.control.shipper.told(json.dumps({"session": session, "have": have}).encode())
+
+    def kill(self) -> None:
+        """What kill -9 leaves: what was written to files, and nothing that was in memory."""
+        self.recorder = recorder_in(self.folder, **self.limits)
+        self.connect()
+
+    def move(self, most: int = 8) -> None:
+        self.control.shipper.service(self.take, most)
+
+    def take(self, data: bytes) -> bool:
+        bundle = decode(data)
+        assert bundle is not None
+        self.recorder.take(bundle)
+        return True
+
+    def flush(self) -> None:
+        report = self.recorder.flush()
+        self.control.shipper.told(json.dumps({"ack": report.have}).encode())
+
+    def finish(self) -> SessionReader:
+        self.control.shipper.end(time.monotonic_ns())
+        while self.control.shipper.behind:
+            self.move()
+        self.recorder.close()
+        return SessionReader(self.folder / "session.mcap")
+
+
+def test_a_session_is_written_bit_for_bit(tmp_path: Path) -> None:
+    line = Line(tmp_path)
+    for _ in range(200):
+        line.control.tick()
+        line.move()
+    reader = line.finish()
+    same_ticks(reader, range(200))
+    assert not reader.damage and len(reader.parts) == 1
+    assert (reader.pmus, reader.instances, reader.flags) == (HEAD.pmus, HEAD.instances, HEAD.flags)
+    assert (reader.configs, reader.ini_text) == (CONFIGS, HEAD.ini_text)
+    assert reader.metadata["seed"] == "7"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_kills_at_random_lose_nothing_that_the_controller_keeps(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    line = Line(tmp_path, max_minutes=1 / 20)
+    deaths = 0
+    for _ in range(700):
+        line.control.tick()
+        if rng.random() < 0.9:
+            line.move()
+        if rng.random() < 0.05:
+            line.flush()
+        if rng.random() < 0.02:
+            line.kill()
+            deaths += 1
+    reader = line.finish()
+    same_ticks(reader, range(700))
+    assert deaths > 5 and not reader.damage and not any(tick.after_loss for tick in reader.ticks())
+    assert len(reader.parts) > 4
+    for part in reader.parts:
+        assert SessionReader(part.log.path).configs == CONFIGS
+
+
+def test_a_kill_between_the_log_and_the_state_is_no_doubling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(tmp_path)
+    for _ in range(50):
+        line.control.tick()
+        line.move()
+    line.flush()
+    for _ in range(50):
+        line.control.tick()
+        line.move()
+    monkeypatch.setattr(state, "save", lambda folder, state: False)
+    line.flush()
+    assert len(line.control.shipper.ring) == 50  # nothing is acknowledged that would be cut off
+    monkeypatch.undo()
+    line.kill()
+    same_ticks(line.finish(), range(100))
+
+
+def test_what_was_flushed_stays_when_both_processes_die(tmp_path: Path) -> None:
+    line = Line(tmp_path)
+    for number in range(300):
+        line.control.tick()
+        line.move()
+        if number % 30 == 29:
+            line.flush()
+    frozen = tmp_path / "frozen.mcap"
+    shutil.copy(tmp_path / "session.mcap", frozen)
+    line.control.tick()
+    reader = SessionReader(frozen)
+    same_ticks(reader, range(300))
+    assert reader.damage.cut and not reader.damage.losses
+
+
+def test_the_next_session_takes_a_free_name_and_never_another_s_parts(tmp_path: Path) -> None:
+    (tmp_path / "session-2.part2.mcap").write_text("somebody's")
+    first = Line(tmp_path, session=1)
+    first.control.tick()
+    first.move()
+    second = FakeControl(tmp_path / "run", session=2)
+    second.tick()
+    first.control = second
+    first.connect()
+    for _ in range(10):
+        first.move()
+    first.recorder.close()
+    assert sorted(path.name for path in tmp_path.glob("*.mcap")) == [
+        "session-2.part2.mcap",
+        "session-3.mcap",
+        "session.mcap",
+    ]
+    for name in ("session.mcap", "session-3.mcap"):
+        same_ticks(SessionReader(tmp_path / name), range(1))
+    third = Line(tmp_path, session=3)
+    third.control.tick()
+    third.move()
+    third.flush()
+    assert third.recorder.flush().file.endswith("session-4.mcap")
+
+
+def test_what_fell_out_of_the_ring_is_a_gap_that_the_log_tells(tmp_path: Path) -> None:
+    line = Line(tmp_path, ring=Ring(600 * NS, 60_000))
+    for _ in range(20):
+        line.control.tick()
+        line.move()
+    line.flush()
+    for _ in range(200):
+        line.control.tick()
+    dropped = line.control.shipper.ring.first - 24  # four configurations, twenty ticks
+    assert dropped > 50
+    reader = line.finish()
+    same_ticks(reader, [*range(20), *range(20 + dropped, 220)])
+    events = [(e.name, e.subject, e.detail) for tick in reader.ticks() for e in tick.record.events]
+    assert [event[:2] for event in events] == [("log_gap", "log")]
+    assert events[0][2].startswith(f"{dropped} ticks were not logged: the server was away")
+    assert [tick.record.tick_ns for tick in reader.ticks() if tick.after_loss] == [tick_at(20 + dropped).record.tick_ns]
+    assert reader.parts[1].unlogged == dropped and line.recorder.flush().gaps == 1
+
+
+def test_a_session_joined_late_begins_with_a_gap_and_all_configurations(tmp_path: Path) -> None:
+    line = Line(tmp_path, ring=Ring(600 * NS, 60_000))
+    for _ in range(200):
+        line.control.tick()
+    missing = line.control.shipper.ring.first
+    reader = line.finish()
+    assert reader.configs == CONFIGS
+    (event,) = [event for tick in reader.ticks() for event in tick.record.events]
+    assert event.detail.startswith(f"{missing} ticks were not logged")
+
+
+def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
+    line = Line(tmp_path)
+    line.control.tick()
+    line.move()
+    good = tick_at(0).record.tick_ns
+    nonsense = [
+        Bundle(Kind.TICK, 5, 7, good, (Entry("Nonsense", "", b"", 1, 1),)),
+        Bundle(Kind.TICK, 6, 7, good, (Entry("Tick", "N1", b"", 1, 1),)),
+        Bundle(Kind.TICK, 7, 7, -1),
+        Bundle(Kind.TICK, 3, 7, good, (Entry("Tick", "", b"\xff", 1, 1),)),
+        Bundle(Kind.TICK, 8, 99, good),
+        Bundle(Kind.HEAD, 0, 8, 0, (Entry("head", "values", b"{", 0, 1),)),
+        Bundle(Kind.HEAD, 0, 8, 0, (Entry("head", "values", b"{", 7, 9),)),
+        Bundle(Kind.HEAD, 0, 8, 0, ()),
+    ]
+    for bundle in nonsense:
+        line.recorder.take(bundle)
+    line.recorder.close()
+    assert line.recorder.malformed == 4 and line.recorder.gaps == 3
+    same_ticks(SessionReader(tmp_path / "session.mcap"), range(1))
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"[1]", b'{"session": 7, "key": 1, "path": "x", "have": 0}', b"\xff"])
+def test_a_damaged_state_begins_a_new_log(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / state.FILE).write_bytes(content)
+    assert recorder_in(tmp_path).resumes == (None, -1)
+
+
+def test_a_log_that_is_gone_is_begun_anew(tmp_path: Path) -> None:
+    line = Line(tmp_path)
+    for _ in range(50):
+        line.control.tick()
+        line.move()
+    line.flush()
+    (tmp_path / "session.mcap").unlink()
+    line.kill()
+    line.control.tick()
+    reader = line.finish()
+    assert [e.name for tick in reader.ticks() for e in tick.record.events] == ["log_gap"]
+    same_ticks(reader, [50])
+
+
+def test_a_folder_that_cannot_be_written_is_tried_again(tmp_path: Path) -> None:
+    run_folder = tmp_path / "run"
+    run_folder.mkdir()
+    line = Line(tmp_path)
+    line.recorder = Recorder(str(tmp_path / "later" / "session.mcap"), run_folder)
+    line.connect()
+    for _ in range(100):
+        line.control.tick()
+        line.move()
+    line.flush()
+    report = line.recorder.flush()
+    assert report.refused and report.unlogged == 100 and report.have == 103
+    (tmp_path / "later").mkdir()
+    for _ in range(700):
+        line.control.tick()
+        line.move()
+    line.control.shipper.end(0)
+    line.move()
+    line.recorder.close()
+    (path,) = (tmp_path / "later").glob("*.mcap")
+    reader = SessionReader(path)
+    back = list(reader.ticks())
+    assert 0 < len(back) < 700 and back[-1].record.tick_ns == tick_at(799).record.tick_ns
+    assert back[0].record.events[-1].detail.startswith(f"{800 - len(back)} ticks were not logged: ")
+
+
+def test_a_log_of_two_lives_exports_without_a_gap(tmp_path: Path) -> None:
+    from dcon.cli import dcon
+
+    line = Line(tmp_path)
+    for number in range(100):
+        line.control.tick()
+        line.move()
+        if number == 50:
+            line.flush()
+            line.kill()
+    line.finish()
+    assert run(dcon(), ["export", str(tmp_path / "session.mcap"), str(tmp_path / "t.csv")]) == 0
+    assert len((tmp_path / "t.csv").read_text().splitlines()) == 101
+    assert T0 == tick_at(0).record.tick_ns
