@@ -40,7 +40,16 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {path.relative_to(ROOT).as_posix(): path for path in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
 WITH_COMMANDS = PAGES | {"captures/README.md": ROOT / "captures" / "README.md"}
-EXPLAINED = ("pmutools/c37118", "pmutools/formats", "pmutools/net", "pmutools/measure", "pmutools/report", "dcon/core")
+EXPLAINED = (
+    "pmutools/c37118",
+    "pmutools/formats",
+    "pmutools/net",
+    "pmutools/measure",
+    "pmutools/report",
+    "dcon/core",
+    "dcon/link",
+    "dcon/watchdog",
+)
 IMAGE_LIMIT_BYTES = 200_000
 TIME_LIMIT_S = 60
 INCOMPLETE, INTERRUPTED = 3, 130

@@ -16,7 +16,7 @@ from generate import (
     streams,
     structure,
     studies,
-    trials,
+    watchdog,
 )
 
 GENERATORS: dict[str, Callable[[], str]] = {
@@ -26,6 +26,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     **player.GENERATORS,
     **live.GENERATORS,
     **controller.GENERATORS,
+    **watchdog.GENERATORS,
     **matrix.GENERATORS,
     **measures.GENERATORS,
     **studies.GENERATORS,

@@ -18,7 +18,7 @@ from dcon.core.system import DRIVING, MODE_IS_FREE, ORDERS, PERMISSIVES, TRANSIT
 from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
 from dcon.drivers import udp_command
-from dcon.settings import ELSEWHERE, Log, Output, Platform, Server, Site, Watchdog
+from dcon.settings import ELSEWHERE, Log, Output, Platform, Server, Site
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
@@ -220,7 +220,6 @@ GENERATORS = {
     "settings-supervisor": lambda: numbers(Thresholds),
     "settings-probing": lambda: numbers(Probing, ("samples",)),
     "settings-pdci": lambda: numbers(Line),
-    "settings-watchdog": lambda: keys(Watchdog),
     "settings-server": lambda: keys(Server),
     "settings-pmu": lambda: keys(Site),
     "settings-output": lambda: keys(Output),
