@@ -15,7 +15,7 @@ from types import FrameType
 from typing import Any, Final, NamedTuple
 
 from dcon.watchdog import codec, links
-from dcon.watchdog.core import Decision, Event, step
+from dcon.watchdog.core import Decision, Event, estop_bits, step
 from dcon.watchdog.files import Lines
 from dcon.watchdog.limits import TICK_MS, Rules
 from dcon.watchdog.memory import MS, Item, Memory
@@ -141,7 +141,8 @@ class Watchdog:
         forward = codec.encode_command(self._memory.sequence, time.time_ns(), 0.0, 0.0, 0)
         self._output.send(forward)
         memory = self._memory
-        status = codec.encode_status(self._counter, time.monotonic_ns(), 0, 0, memory.state, False, memory.latched)
+        estop = estop_bits(memory)
+        status = codec.encode_status(self._counter, time.monotonic_ns(), 0, estop, memory.state, False, memory.latched)
         for listener in self._listeners:
             listener.send(status)
         self._inbox.close()

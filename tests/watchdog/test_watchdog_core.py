@@ -387,6 +387,13 @@ def test_a_reset_where_nothing_is_tripped_is_refused() -> None:
         assert bench.state is before and bench.named[-1] == "refused"
 
 
+def test_a_reset_does_not_hide_that_the_request_fell() -> None:
+    bench = Bench().closed()
+    bench.relays = False
+    bench.reset()
+    assert bench.state is State.OPEN and bench.named == ["close", "refused", "open"]
+
+
 def test_causes_that_come_after_the_trip_are_kept() -> None:
     bench = Bench().closed()
     bench.tick(Malformed("crc"))
