@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -63,6 +64,7 @@ NO_CLOCK = [
     "pmutools.measure",
     "dcon.core",
     "dcon.limiter",
+    *(f"dcon.watchdog.{name}" for name in ("codec", "core", "limits", "memory", "rules")),
 ]
 EDGES = {"time", "socket", "select", "selectors", "threading", "subprocess", "asyncio"}
 
@@ -140,6 +142,13 @@ def test_imports_go_down(module: str, path: Path) -> None:
         assert not any(within(module, name) and not within(target, name) for name in ALONE), where
         below, other = layer_of(target)
         assert below < number or other == package, where
+
+
+@pytest.mark.parametrize(("module", "path"), [m for m in MODULES if any(within(m[0], n) for n in ALONE)])
+def test_those_alone_need_the_standard_library_only(module: str, path: Path) -> None:
+    for target, line in imports(path):
+        known = target.split(".")[0] in sys.stdlib_module_names or any(within(target, name) for name in ALONE)
+        assert known, f"{path.relative_to(ROOT)}:{line} imports {target}"
 
 
 def test_the_codec_is_a_chain() -> None:

@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 
 from dcon.drivers.udp_command import CommandOut, encode
-from dcon.link.beats import LoopName, decode_status, encode_beat
+from dcon.link.beats import LoopName, Verb, decode_status, encode_beat, encode_word
 
 LOOPS = [LoopName(name) for name in ("control", "udp", "parse", "gps", "gui", "pdci")]
 PERIOD_NS = 10**9 // 60
@@ -44,10 +44,11 @@ def platform(folder: str, volts: float = 5.0) -> None:
 
 
 def flood(folder: str, per_s: float) -> None:
-    """Garbage, until killed."""
+    """Garbage, until killed; a word that is refused says that it begins."""
     out = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     out.setblocking(False)
     to, start_ns, sent = os.path.join(folder, "watchdog.in"), time.monotonic_ns(), 0
+    out.sendto(encode_word(Verb.RESET, "flood"), to)
     while True:
         due = int((time.monotonic_ns() - start_ns) / 1e9 * per_s)
         for _ in range(sent, due):

@@ -173,6 +173,7 @@ def test_a_flood_delays_no_opening_and_costs_a_bounded_number_of_rounds(tmp_path
     with watchdog(folder, *CALM, f"--estop-a={line}", "--limit", "malformed_max=1e6") as dog:
         with beating(folder, "flood=10000"):
             begun_ns = dog.event("start")["monotonic_ns"]
+            assert dog.event("refused")["who"] == "flood"
             time.sleep(1.0)
             pressed_ns = time.monotonic_ns()
             line.write_text("0\n")
@@ -181,7 +182,7 @@ def test_a_flood_delays_no_opening_and_costs_a_bounded_number_of_rounds(tmp_path
             assert dog.process.wait(timeout=10) == 0
         end = dog.event("end")
         seconds = (end["monotonic_ns"] - begun_ns) / 1e9
-        assert end["datagrams"] > 1000
+        assert end["datagrams"] > 500
         assert end["rounds"] <= 1100 * seconds  # a millisecond apart, and ticks
 
 
