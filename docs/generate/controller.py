@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields
 from enum import StrEnum
+from types import ModuleType
 from typing import Any
 
 from dcon.core import instance
@@ -17,8 +18,9 @@ from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, MODE_IS_FREE, ORDERS, PERMISSIVES, TRANSITIONS, Trigger
 from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
-from dcon.drivers import udp_command
-from dcon.settings import ELSEWHERE, Log, Output, Platform, Server, Site
+from dcon.drivers import line_status, udp_command
+from dcon.places import IioKeys, OutputRegisters, StatusRegisters
+from dcon.settings import ELSEWHERE, LineInput, Log, Output, Platform, Server, Site, Watchdog
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
@@ -190,11 +192,11 @@ def _default(value: object) -> str:
     return code(",".join(map(str, value)) if isinstance(value, tuple) else _number(value))
 
 
-def command_datagram() -> str:
-    """The output driver's datagram, from its module's text."""
-    _, layout, rest = (udp_command.__doc__ or "").split("\n\n", 2)
+def datagram(module: ModuleType) -> str:
+    """A driver's datagram, from its module's text."""
+    _, layout, rest = (module.__doc__ or "").split("\n\n", 2)
     fields_ = "\n".join(part.strip() for part in layout.split("|"))
-    return f"{fenced(fields_)}\n\n{udp_command.SIZE} bytes, big-endian. {prose(rest)}"
+    return f"{fenced(fields_)}\n\n{module.SIZE} bytes, big-endian. {prose(rest)}"
 
 
 def scenarios() -> str:
@@ -219,13 +221,18 @@ GENERATORS = {
     "settings-controller": lambda: numbers(Params, ELSEWHERE),
     "settings-supervisor": lambda: numbers(Thresholds),
     "settings-probing": lambda: numbers(Probing, ("samples",)),
-    "settings-pdci": lambda: numbers(Line),
+    "settings-pdci": lambda: f"{keys(LineInput)}\n\n{numbers(Line)}",
+    "settings-watchdog": lambda: keys(Watchdog),
     "settings-server": lambda: keys(Server),
     "settings-pmu": lambda: keys(Site),
     "settings-output": lambda: keys(Output),
     "settings-platform": lambda: keys(Platform),
     "settings-log": lambda: keys(Log),
-    "command-datagram": command_datagram,
+    "command-datagram": lambda: datagram(udp_command),
+    "status-datagram": lambda: datagram(line_status),
+    "iio-keys": lambda: keys(IioKeys),
+    "modbus-output-keys": lambda: keys(OutputRegisters),
+    "modbus-status-keys": lambda: keys(StatusRegisters),
     "scenarios": scenarios,
     "plants": plants,
 }
