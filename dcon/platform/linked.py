@@ -23,7 +23,7 @@ from dcon.link.paths import Sender
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
 from dcon.platform.children import Children
-from dcon.platform.news import Heard, hear, is_healthy, surroundings, watchdog_of
+from dcon.platform.news import Heard, hear, is_there, surroundings, watchdog_of
 from dcon.platform.ports import Ends, Told
 from dcon.platform.pulse import Pulse
 from dcon.session.codec import Timing, Watchdog
@@ -233,7 +233,8 @@ class Linked:
     def _wait(self, stopping: Callable[[], bool]) -> None:
         """Drive 0 V and beat until the watchdog finds everybody well, so that the first tick finds it healthy.
 
-        Where that takes too long the session begins without, and shows it. Raises SourceError where the front or the
+        One that has tripped waits for an operator, and so would this; where it takes too long the session begins
+        without, and shows it. Raises SourceError where the front or the
         aides cannot start.
         """
         clock = self._clock
@@ -246,7 +247,7 @@ class Linked:
             if trouble := self._children.trouble():
                 self._frames.keep()  # its last words
                 raise SourceError(trouble)
-            if is_healthy(self._news.heard, now_ns):
+            if is_there(self._news.heard, now_ns):
                 return
             if now_ns >= end_ns:
                 LOG.warning("the watchdog is not healthy after %g s; it says why", HEALTHY_S)

@@ -145,6 +145,12 @@ def is_healthy(heard: Heard, now_ns: int) -> bool:
     return status.healthy and status.state is not WatchdogState.TRIPPED
 
 
+def is_there(heard: Heard, now_ns: int) -> bool:
+    """Whether there is nothing to wait for: the watchdog is healthy, or has tripped, which only an operator ends."""
+    tripped = heard.status is not None and heard.status.state is WatchdogState.TRIPPED
+    return is_healthy(heard, now_ns) or tripped
+
+
 def _gps_age_s(heard: Heard, now_ns: int) -> float | None:
     if heard.gps_age_s is None:
         return None

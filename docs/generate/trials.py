@@ -64,13 +64,13 @@ TRIALS = {
         "the watchdog is killed", "FAULT", "open", ("watchdog", "fault"), ("watchdog",), "no command leaves any more"
     ),
     "front-killed": Trial(
-        "the front is killed", "STANDBY", "tripped", ("watchdog", "fault"), ("platform",), "a new session, open loop"
+        "the front is killed", "FAULT", "tripped", ("watchdog", "fault"), ("platform",), "a new session, open loop"
     ),
     "aides-killed": Trial(
         "the aides are killed", "STANDBY", "open", ("rampdown",), ("platform",), "a new session, open loop"
     ),
     "platform-killed": Trial(
-        "the control process is killed", "STANDBY", "tripped", (), ("platform",), "a new session, open loop"
+        "the control process is killed", "FAULT", "tripped", (), ("platform",), "a new session, open loop"
     ),
     "platform-stopped": Trial(
         "the control process hangs for half a second (SIGSTOP)", "FAULT", "tripped", ("watchdog", "fault")

@@ -19,7 +19,12 @@ def swing_mw(at_s: float) -> float:
 
 
 def watched(
-    gain: float = 1.0, lag_ms: float = 11.0, size: float = 1.0, noise_mw: float = 0.0, every: int = 1, drift: float = 0.0
+    gain: float = 1.0,
+    lag_ms: float = 11.0,
+    size: float = 1.0,
+    noise_mw: float = 0.0,
+    every: int = 1,
+    drift: float = 0.0,
 ) -> LineResponse:
     """30 s of a line that gives ``gain`` times the command, held from tick to tick, after ``lag_ms``."""
     rng = random.Random(5)

@@ -57,10 +57,11 @@ def recording(path: Path, names: tuple[str, ...] = NAMES) -> Path:
 
 
 class Around(threading.Thread):
-    """What the aides would be told by the site: the clock's lock, ten times a second, and the line's status."""
+    """What a site tells, ten times a second: the clock's lock, and the status of a line that obeys."""
 
-    def __init__(self, run_dir: Path, line_port: int) -> None:
+    def __init__(self, run_dir: Path, line_port: int, gateway: Gateway) -> None:
         super().__init__(daemon=True)
+        self._gateway = gateway
         self.gps_age_s = 0.0
         self.in_service = True
         self._control, self._line = paths.Sender(run_dir / paths.CONTROL), ("127.0.0.1", line_port)
@@ -73,7 +74,8 @@ class Around(threading.Thread):
             number += 1
             news = {"kind": "gps", "age_s": self.gps_age_s, "source": "test", "detail": ""}
             self._control.send(json.dumps(news).encode())
-            line = Pdci(time.time_ns(), 2000.0, self.in_service, True, 2000.0)
+            driven_mw = self._gateway.commands[-1].command_mw if self._gateway.commands else 0.0
+            line = Pdci(time.time_ns(), 2000.0 + driven_mw, self.in_service, True, 2000.0)
             with suppress(OSError):
                 self._sock.sendto(line_status.encode(number, line), self._line)
 
@@ -119,7 +121,7 @@ keys = {self.keys}
 path = {self.log}
 {extra}"""
         self.ini.write_text(Streams(NAMES).ini(urls=urls, extra=settings))
-        self.around = Around(self.run_dir, line_port)
+        self.around = Around(self.run_dir, line_port, self.gateway)
         self._processes: list[subprocess.Popen[bytes]] = []
         self.run: subprocess.Popen[bytes] | None = None
 
