@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import signal
 import sys
 import time
@@ -22,6 +23,7 @@ from support.swing import Streams
 
 from dcon.cli import dcon
 from dcon.core.values import Event, Order
+from dcon.drivers.udp_command import CommandOut
 from dcon.link.orders import SignedOrder, sign
 from dcon.server.client import Client
 from dcon.session.log import LoggedTick, SessionReader
@@ -45,8 +47,8 @@ class Seen:
     from_ns: int
     to_ns: int = 0
     state: str = ""
-    commands: tuple[int, int] = (0, 0)
-    """Those of the gateway, first and past the last."""
+    commands: list[CommandOut] = field(default_factory=list)
+    """What the gateway got meanwhile."""
     watchdog: list[dict[str, Any]] = field(default_factory=list)
     """Events of its log meanwhile."""
     ticks: list[LoggedTick] = field(default_factory=list)
@@ -170,7 +172,11 @@ def perform(site: Running, name: str, do: Callable[[Running], Any]) -> Seen:
     trial = Seen(time.time_ns())
     undo = do(site)
     if TRIALS[name].restarts:
-        site.until(lambda _: site.said().count("started again in") > restarts, "started again")
+        site.until(lambda _: site.restarts() > restarts, "started again")
+    if "watchdog" in TRIALS[name].restarts:
+        site.until(
+            lambda _: any(event["event"] == "start" for event in site.watchdog_events()[begun:]), "a new watchdog"
+        )
     after = trial.from_ns
     site.until(
         lambda now: now["controller_connected"] and now["state"] == TRIALS[name].state and now["tick_ns"] > after, name
@@ -179,8 +185,8 @@ def perform(site: Running, name: str, do: Callable[[Running], Any]) -> Seen:
     trial.state = site.in_state(*STATES)["state"]
     trial.to_ns = time.time_ns()
     trial.watchdog = site.watchdog_events()[begun:]
-    trial.commands = (sent, len(site.gateway.commands))
-    trial.restarts = [line.split()[-12] for line in site.said().splitlines() if "started again in" in line][restarts:]
+    trial.commands = site.gateway.commands[sent:]
+    trial.restarts = re.findall(r"the (\w+) process has ended, .*; started again in", site.said())[restarts:]
     if callable(undo):
         undo()
     else:
@@ -267,11 +273,19 @@ def test_the_relays_open_within_the_time_that_is_stated(name: str, seen: dict[st
         assert 0 < trip["monotonic_ns"] - killed_ns < 150_000_000
 
 
+@pytest.mark.parametrize("name", ["estop", "watchdog-killed", "front-killed", "platform-killed", "platform-stopped"])
+def test_no_command_leaves_after_that(name: str, seen: dict[str, Seen]) -> None:
+    trial = seen[name]
+    driven = [c.time_ns - trial.from_ns for c in trial.commands if c.output_v]
+    assert max(driven, default=0) < 150_000_000
+
+
 def test_nothing_is_armed_again_by_itself(seen: dict[str, Seen]) -> None:
     for name in ("front-killed", "aides-killed", "platform-killed"):
         begun = [tick for tick in seen[name].ticks if tick.record.mode == "open_loop"]
         assert begun and not any(tick.orders for tick in begun)
-        assert {tick.record.state for tick in begun} <= {"INIT", "STANDBY"}
+        assert {tick.record.state for tick in begun} <= {"INIT", "STANDBY", "FAULT"}
+        assert not any(tick.record.output_v for tick in begun)
 
 
 def test_the_table_has_every_trial() -> None:

@@ -107,6 +107,8 @@ time_source = none
 gps_required = yes
 [supervisor]
 gps_holdover_s = 0.5
+gap_ms = 500
+latency_max_ms = 500
 [pdci]
 required = yes
 url = udp://127.0.0.1:{line_port}
@@ -143,7 +145,11 @@ path = {self.log}
             for word in ("--to", f"udp://127.0.0.1:{port}?idcode={Streams((name,)).configs[name].idcode}")
         ]
         delayed = ("--delay", "normal(60,1)")
-        self._start("pmutools.cli", "play", str(played), *to, *delayed, "--loop", "0", "--cfg-period", "1", "--quiet")
+        player = self._start(
+            *("pmutools.cli", "play", str(played), *to, *delayed, "--loop", "0", "--cfg-period", "1", "--quiet")
+        )
+        with suppress(OSError):  # where it is permitted: a PMU has no other work
+            os.sched_setscheduler(player.pid, os.SCHED_FIFO, os.sched_param(5))
         self.gateway.start()
         self.around.start()
         self.run = self._start("dcon.cli", "run", "--ini", str(self.ini), "--run-dir", str(self.run_dir), *arguments)
@@ -198,6 +204,10 @@ path = {self.log}
     def in_state(self, *states: str) -> dict[str, Any]:
         """The status once the controller that is connected now is in one of ``states``."""
         return self.until(lambda now: now["controller_connected"] and now["state"] in states, f"in {states}")
+
+    def restarts(self) -> int:
+        """Of processes that ``dcon run`` has started again, so far."""
+        return self.said().count("started again in")
 
     def watchdog_events(self) -> list[dict[str, Any]]:
         lines = self.watchdog_log.read_text().splitlines() if self.watchdog_log.exists() else []
