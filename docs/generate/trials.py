@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from generate.markdown import code, table
+
+EXAMPLES = Path(__file__).parents[1] / "systemd"
 
 
 @dataclass(frozen=True)
@@ -89,4 +92,13 @@ def trials() -> str:
     return table(("what happens", "controller", "relays", "events", "besides"), rows)
 
 
-GENERATORS = {"trials": trials}
+def example(name: str, language: str) -> str:
+    """A file of ``docs/systemd``, whole."""
+    return f"```{language}\n{(EXAMPLES / name).read_text(encoding='utf-8').strip()}\n```"
+
+
+GENERATORS = {
+    "trials": trials,
+    "systemd-unit": lambda: example("dcon.service", "ini"),
+    "site-ini": lambda: example("site.ini", "ini"),
+}

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from dcon.cli import COMMANDS
+from dcon.cli import COMMANDS, dcon
 from dcon.cli.run import command as run_command
 from dcon.platform.household import ENDED, STARTED
+from dcon.settings import load
+from pmutools.cli.shell import run
 
 UNITS = Path(__file__).parents[2] / "docs" / "systemd"
 PROGRAM = "/opt/pmutools/bin/dcon"
@@ -34,11 +36,12 @@ def keys(unit: Path) -> dict[str, list[str]]:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_systemd_finds_nothing_wrong(tmp_path: Path) -> None:
-    for unit in UNITS.iterdir():
+    units = [*SERVICES, UNITS / "dcon.target"]
+    for unit in units:
         text = unit.read_text()
         assert text.count(PROGRAM) == (unit.suffix == ".service")
         (tmp_path / unit.name).write_text(text.replace(PROGRAM, "/bin/true"))
-    names = [str(tmp_path / unit.name) for unit in UNITS.iterdir()]
+    names = [str(tmp_path / unit.name) for unit in units]
     done = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", *names],
         capture_output=True,
@@ -68,6 +71,16 @@ def test_what_must_be_in_a_unit(unit: Path) -> None:
     assert found["Service.StateDirectoryMode"] == ["0700"]  # nobody else may enter the run folder
     assert ("Service.WatchdogSec" in found) == (found["Service.Type"] == ["notify"])
     assert found["Service.Restart"] == ["on-failure"]
+
+
+def test_the_site_of_the_page_is_one_that_dcon_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    settings = load(UNITS / "site.ini")
+    assert [site.name for site in settings.sites] == ["N1", "N2", "S1", "S2"]
+    assert str(settings.platform.run_dir) == "/var/lib/dcon/run" and settings.output.needs_process
+    required = settings.params.required
+    assert required.gps and required.watchdog and required.server and settings.params.line.required
+    assert run(dcon(), ["check", "--ini", str(UNITS / "site.ini")]) == 0
+    assert "gain_mw_per_mhz" in capsys.readouterr().out
 
 
 def test_systemd_waits_longer_for_the_end_than_dcon_run_does() -> None:

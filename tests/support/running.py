@@ -227,6 +227,10 @@ path = {self.log}
         os.kill(pid, number)
         return at_ns
 
+    def caught_up(self) -> None:
+        """Wait until the server has what the controller has just decided."""
+        self.until(lambda now: now["controller_connected"] and time.time_ns() - now["tick_ns"] < NS // 4, "caught up")
+
     # --- ordering
 
     def order(self, name: str, **given: Any) -> dict[str, Any]:
