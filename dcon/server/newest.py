@@ -90,14 +90,14 @@ class Newest:
             "mode": tick.mode,
             "active": names[active] if 0 <= active < len(names) else None,
             "gain_mw_per_mhz": tick.gain_mw_per_mhz,
-            "delta_f_mhz": _number(tick.delta_f_mhz),
+            "delta_f_mhz": tick.delta_f_mhz,
             "command_mw": tick.command_mw,
             "output_v": tick.output_v,
             "probe_mw": tick.probe_mw,
             "flags": self._flags_up(tick.flags),
             "instances": self._instances(),
             "pmus": [
-                {"name": name, "age_ms": _number(age), "f_hz": _number(f)}
+                {"name": name, "age_ms": age, "f_hz": f}
                 for name, age, f in zip(self.head.pmus, tick.age_ms, tick.f_hz, strict=False)
             ],
             "watchdog": self._watchdog(),
@@ -134,8 +134,8 @@ class Newest:
                 "acknowledged": flag.acknowledged,
                 "since_ns": flag.last_ns,
                 "times": flag.times,
-                "value": _number(flag.value),
-                "limit": _number(flag.limit),
+                "value": flag.value,
+                "limit": flag.limit,
             }
             for flag in known
         ]
@@ -155,7 +155,7 @@ class Newest:
                 "name": name,
                 "state": state,
                 "active": active,
-                "delta_f_mhz": _number(delta),
+                "delta_f_mhz": delta,
                 "command_mw": command,
                 "reason": reason,
             }
@@ -172,9 +172,7 @@ class Newest:
             "estop": watchdog.estop,
             "latched": watchdog.latched,
             "reason": watchdog.reason,
-            "beats_ms": {
-                name: _number(age) for name, age in zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)
-            },
+            "beats_ms": dict(zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)),
         }
 
     def _line(self) -> dict[str, Any] | None:
@@ -183,8 +181,8 @@ class Newest:
             return None
         return {
             "time_ns": line.time_ns,
-            "power_mw": _number(line.power_mw),
-            "scheduled_mw": _number(line.scheduled_mw),
+            "power_mw": line.power_mw,
+            "scheduled_mw": line.scheduled_mw,
             "in_service": line.in_service,
             "dcon_enabled": line.dcon_enabled,
         }
@@ -193,21 +191,23 @@ class Newest:
         timing = self._last.get("Timing")
         if timing is None:
             return None
-        return (
-            None if timing is None else {"compute_us": _number(timing.compute_us), "late_us": _number(timing.late_us)}
-        )
+        return None if timing is None else {"compute_us": timing.compute_us, "late_us": timing.late_us}
 
 
 def _surroundings(message: Any) -> dict[str, Any]:
     told = codec.decode_surroundings(message)._asdict()
-    return {name: _number(value) for name, value in told.items() if name not in ("pdci", "unread")}
+    return {name: value for name, value in told.items() if name not in ("pdci", "unread")}
 
 
-def _number(value: Any) -> Any:
-    """JSON has no NaN."""
+def _finite(value: Any) -> Any:
+    """With None for what is no number: JSON has no NaN, and no infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def to_json(values: dict[str, Any]) -> bytes:
-    """One line."""
-    return json.dumps(values, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+    """One line; what is no finite number is null."""
+    return json.dumps(_finite(values), separators=(",", ":"), allow_nan=False).encode() + b"\n"

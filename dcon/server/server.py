@@ -8,6 +8,7 @@ import os
 import selectors
 import socket
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from dcon.limiter import MW_PER_V
@@ -71,6 +72,7 @@ class Server:
         self.newest = Newest()
         self.response = LineResponse()
         self.report = Report()
+        self.failures = 0
         self.malformed = 0
         """Messages on the controller's socket that are no bundles."""
         self._selector = selectors.DefaultSelector()
@@ -107,7 +109,7 @@ class Server:
             while not self.stopping:
                 now_ns = clock.monotonic_ns()
                 for key, events in self._selector.select(min(max(beat_ns - now_ns, 0) / 1e9, 0.05)):
-                    key.data(events, clock.monotonic_ns(), clock.realtime_ns())
+                    self._safely(key.data, events)
                 now_ns = clock.monotonic_ns()
                 self._acknowledge()
                 self.operators.answer(self.desk.pending.expired(now_ns))
@@ -121,6 +123,13 @@ class Server:
                     self._tell(now_ns)
         finally:
             self.close()
+
+    def _safely(self, ready: Callable[[int, int, int], None], events: int) -> None:
+        try:
+            ready(events, self.clock.monotonic_ns(), self.clock.realtime_ns())
+        except Exception:  # the edge of the loop: whatever one connection brings, the others are served
+            self.failures += 1
+            LOG.exception("a connection brought something that the server failed on; it goes on")
 
     def status(self) -> dict[str, Any]:
         """For operators."""
@@ -149,6 +158,7 @@ class Server:
                 "orders_relayed": self.desk.relayed,
                 "orders_pending": len(self.desk.pending),
                 "malformed": self.malformed,
+                "failures": self.failures,
                 "undecodable": self.newest.undecodable,
             },
         }

@@ -37,7 +37,7 @@ def watched(
         if number % every == 0:
             time_ns = tick_ns - rng.randrange(TICK_NS)
             then = (time_ns - round(lag_ms * 1e6) - T0) // TICK_NS
-            power = gain * commands[max(then, 0)] + rng.gauss(0, noise_mw) + drift * number / 60
+            power = gain * commands[max(then, 0)] + rng.gauss(0, noise_mw)
             watch.line(time_ns, power)
             watch.line(time_ns, 1e6)  # the same report again
     return watch

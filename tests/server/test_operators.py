@@ -1,0 +1,262 @@
+"""Operators over TCP: orders reach the controller and are answered; nobody else gets anything, nor harms anybody."""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.operated import FakePlatform
+from support.shipped import ServerProcess, eventually
+
+from dcon.cli import dcon
+from dcon.link import paths
+from dcon.link.keys import add_key, read_keys
+from dcon.link.orders import SignedOrder, sign
+from dcon.link.paths import bind_datagram, prepare
+from dcon.server import operators
+from dcon.server.client import Client
+from dcon.session.log import SessionReader
+from pmutools.cli.shell import run
+from pmutools.net.endpoint import Endpoint, Scheme
+
+pytestmark = pytest.mark.realtime
+Ctl = Callable[..., int]
+
+
+class Site:
+    """A server, a platform, and the watchdog's ear."""
+
+    def __init__(self, folder: Path) -> None:
+        self.keys = folder / "operators.ini"
+        for name, may in (("Ada", ()), ("Ben", ("arm",))):
+            add_key(self.keys, name, may)
+        self.server = ServerProcess(folder, f"keys = {self.keys}")
+        self.run_dir = prepare(self.server.run_dir)
+        self.watchdog = bind_datagram(self.run_dir, paths.WATCHDOG)
+        self.platform = FakePlatform(self.run_dir, self.keys)
+        self.server.listens()
+        self.where = Endpoint(Scheme.TCP, "127.0.0.1", self.server.port)
+        eventually(lambda: self.status()["state"] is not None, "no status")
+
+    def status(self) -> dict[str, Any]:
+        with Client(self.where) as client:
+            return client.ask({"ask": "status"})
+
+    def ctl(self, *words: str, who: str | None = "Ada", key: bool = True) -> int:
+        arguments = [*words, "--to", f"127.0.0.1:{self.server.port}", "--why", "a test"]
+        arguments += ["--who", who] if who else []
+        arguments += ["--key", str(self.keys)] if key else []
+        return run(dcon(), ["ctl", *arguments])
+
+    def words(self) -> list[tuple[int, bytes]]:
+        """Of operators that the watchdog was told: verb and who."""
+        found = []
+        with suppress(BlockingIOError):
+            while True:
+                datagram = self.watchdog.recv(100)
+                if datagram[:4] == b"DCO1":
+                    assert len(datagram) == 44
+                    found.append((datagram[4], datagram[8:40].rstrip(b"\0")))
+        return found
+
+    def signed(self, who: str = "Ada", **changes: Any) -> str:
+        now_ns = time.time_ns()
+        order = SignedOrder(who, now_ns, now_ns, "arm")._replace(**changes)
+        return sign(order, read_keys(self.keys)[who].key).decode()
+
+    def end(self) -> None:
+        self.platform.end()
+        if self.server.process.poll() is None:
+            self.server.kill()
+        self.watchdog.close()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    made = Site(tmp_path_factory.mktemp("site"))
+    yield made
+    made.end()
+
+
+def test_orders_reach_the_controller_with_who_and_why(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    assert site.ctl("arm") == 0
+    assert site.ctl("gain", "12.5") == 0
+    assert site.ctl("ack", "frozen", "N1", "--json") == 0
+    taken = site.platform.taken[-3:]
+    assert [(o.name, o.value, o.text, o.who, o.why) for o in taken] == [
+        ("arm", 0.0, "", "Ada", "a test"),
+        ("gain", 12.5, "", "Ada", "a test"),
+        ("ack", 0.0, "frozen N1", "Ada", "a test"),
+    ]
+    out, err = capsys.readouterr()
+    assert err.startswith("arm: accepted; ") and json.loads(out)["accepted"] == "ack"
+
+
+def test_what_the_controller_refuses_is_said(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    assert site.ctl("activate") == 1
+    assert capsys.readouterr().err == "dcon: activate refused: not in STANDBY\n"
+
+
+def test_what_the_link_refuses_is_said_and_logged(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    assert site.ctl("disarm", who="Ben") == 1
+    assert capsys.readouterr().err == "dcon: disarm refused: not allowed to this operator\n"
+    assert site.platform.taken[-1].name == "link_refused" and site.platform.taken[-1].who == "Ben"
+
+
+@pytest.mark.parametrize(("verb", "code"), [("estop", 1), ("release", 2), ("reset", 3)])
+def test_the_watchdog_hears_of_stops(verb: str, code: int, site: Site) -> None:
+    site.words()
+    assert site.ctl(verb) == 0
+    assert site.words() == [(code, b"Ada")] and site.platform.taken[-1].name == verb
+
+
+def test_forged_replayed_reordered_and_forbidden_orders(site: Site) -> None:
+    early, late = site.signed(name="estop"), site.signed(name="estop")
+    forged = early.replace('"estop"', '"reset"')
+    site.words()
+    with Client(site.where) as client:
+        assert client.ask({"signed": forged}) == {"refused": "the signature does not hold"}
+        assert site.words() == []
+        assert client.ask({"signed": late})["accepted"] == "estop"
+        for again in (late, early):
+            assert client.ask({"signed": again}) == {"refused": "replayed, or overtaken by a later order"}
+        stranger = json.loads(early) | {"who": "Eve"}
+        exact = json.dumps(stranger, sort_keys=True, separators=(",", ":"))
+        assert client.ask({"signed": exact}) == {"refused": "unknown operator"}
+        for time_ns in (time.time_ns() - 6 * 10**9, time.time_ns() + 6 * 10**9):
+            answer = client.ask({"signed": site.signed(name="estop", time_ns=time_ns)})
+            assert answer["refused"].endswith("is the operator's clock right?")
+        assert client.ask({"signed": site.signed("Ben", name="estop")}) == {"refused": "not allowed to this operator"}
+        assert client.ask({"signed": "hello"}) == {"refused": "no signed order"}
+        assert client.ask({"signed": "x" * 5000}) == {"refused": "longer than 4000 bytes"}
+    assert site.words() == [(1, b"Ada")]
+
+
+def test_two_askers_get_their_own_answers(site: Site) -> None:
+    with Client(site.where) as one, Client(site.where) as two:
+        one.send({"signed": site.signed(name="activate")})
+        two.send({"signed": site.signed(name="arm")})
+        assert next(two.answers())["accepted"] == "arm"
+        assert next(one.answers()) == {"refused": "not in STANDBY"}
+
+
+def test_status_has_everything(site: Site) -> None:
+    status = site.status()
+    assert status["controller_connected"] is True
+    for key in (
+        *("state", "mode", "active", "gain_mw_per_mhz", "delta_f_mhz", "command_mw", "output_v", "probe_mw", "flags"),
+        *("instances", "pmus", "watchdog", "surroundings", "line", "timing", "events", "log", "response", "clock_ms"),
+    ):
+        assert key in status, key
+    assert [pmu["name"] for pmu in status["pmus"]] == ["N1", "N2", "S1", "S2"]
+    assert len(status["instances"]) == 4 and len(status["events"]) <= 50
+    assert status["server"]["failures"] == 0
+    assert status["log"]["file"].endswith("session.mcap") and status["log"]["unlogged_ticks"] == 0
+
+
+def test_watch_comes_twice_a_second(site: Site) -> None:
+    with Client(site.where) as client:
+        client.send({"ask": "watch"})
+        answers = client.answers()
+        first, second, third = (next(answers) for _ in range(3))
+    assert 0.8e9 < third["time_ns"] - first["time_ns"] < 4e9 and second["tick_ns"] >= first["tick_ns"]
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        (b"hello\n", "no JSON"),
+        (b"[1]\n", "no JSON object"),
+        (b"[" * 9000 + b"\n", "no JSON"),
+        (b'{"ask": "key"}\n', "ask for one of status, watch, or send a signed order"),
+        (b'{"signed": 5}\n', "ask for one of status, watch, or send a signed order"),
+        (b"x" * 20_000, "a line is longer than 16384 bytes"),
+    ],
+)
+def test_lines_without_sense_are_answered(line: bytes, error: str, site: Site) -> None:
+    with socket.create_connection(("127.0.0.1", site.server.port), 5) as sock:
+        sock.sendall(line)
+        assert json.loads(sock.makefile().readline()) == {"error": error}
+
+
+def test_garbage_floods_and_idle_clients_leave_an_operator_served(site: Site) -> None:
+    rng = random.Random(2)
+    idle = [socket.create_connection(("127.0.0.1", site.server.port), 5) for _ in range(200)]
+    for sock in idle[-20:]:
+        with suppress(OSError):
+            sock.sendall(rng.randbytes(3000))
+    with socket.create_connection(("127.0.0.1", site.server.port), 5) as flood:
+        flood.sendall(b'{"ask":"status"}\n' * 300)
+        assert site.ctl("arm") == 0
+        file = flood.makefile()
+        said = [json.loads(file.readline()) for _ in range(300)]
+    fast = [answer for answer in said if answer.get("error") == "more than 20 lines in a second"]
+    assert len(fast) >= 200
+    status = site.status()
+    assert status["server"]["clients"] <= 32 and status["server"]["turned_away"] >= 150
+    for sock in idle:
+        sock.close()
+
+
+def test_a_client_that_does_not_read_is_known_by_what_waits() -> None:
+    """Its answers may not pile up for ever, and a status is not sent after one that waits."""
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+    client = operators.Client(ours, 1, 0)
+    said = 0
+    while client.say(bytes(1000)):
+        said += 1
+        assert client.waiting <= operators.WAITING_BYTES
+    assert said > 256 and client.waiting <= operators.WAITING_BYTES + 1000
+    theirs.close()
+    assert not client.pump()
+    ours.close()
+
+
+def test_the_log_tells_of_orders_and_refusals(site: Site) -> None:
+    eventually(lambda: site.status()["log"]["lag_s"] is not None, "nothing is flushed")
+    time.sleep(0.7)
+    orders = [order for tick in SessionReader(site.server.log).ticks() for order in tick.orders]
+    assert {"Ada"} <= {order.who for order in orders if order.why == "a test"}
+    assert "link_refused" in {order.name for order in orders}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("gain",), "gain: write gain MW_PER_MHZ"),
+        (("gain", "x"), "gain: 'x' is not a number"),
+        (("arm", "5"), "arm takes no value"),
+        (("status", "5"), "status takes no value"),
+    ],
+)
+def test_mistakes_are_a_line(words: tuple[str, ...], said: str, site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    assert site.ctl(*words) == 2
+    assert capsys.readouterr().err == f"dcon: {said}\n"
+    assert site.ctl("arm", key=False) == 2 and "give --key FILE" in capsys.readouterr().err
+    assert site.ctl("arm", who=None) == 2 and "name one with --who" in capsys.readouterr().err
+    assert site.ctl("arm", who="Eve") == 2 and "has no operator 'Eve'; there are Ada, Ben" in capsys.readouterr().err
+
+
+def test_a_deaf_controller_and_none_at_all(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    site.platform.deaf = True
+    began = time.monotonic()
+    site.words()
+    assert site.ctl("estop") == 1 and 1.9 < time.monotonic() - began < 6
+    said = "dcon: estop not answered: the controller has not answered in 2 s; the watchdog was told\n"
+    assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
+    site.platform.end()
+    assert site.ctl("estop") == 1
+    said = "dcon: estop refused: the controller cannot be reached; the watchdog was told\n"
+    assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
+    eventually(lambda: site.status()["controller_connected"] is False, "the end was not seen")
+    assert site.server.end() == 0
+    assert site.ctl("status") == 1
+    assert capsys.readouterr().err.endswith("is dcon server running there?\n")
