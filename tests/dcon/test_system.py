@@ -250,6 +250,31 @@ def test_an_unknown_order_is_refused() -> None:
     assert record.events == (Event("refused", "launch", "no such order"),)
 
 
+def test_what_the_link_refuses_is_an_event_and_nothing_else() -> None:
+    refused = Order("link_refused", text="the signature does not hold", who="Eve", why="0f")
+    for state in (READY, at(S.ACTIVE)):
+        quiet, _ = tick(state)
+        after, record = tick(state, refused)
+        assert after == quiet
+        event = Event("refused", "link", "the signature does not hold; said to be by Eve")
+        assert [e for e in record.events if e.name == "refused"] == [event]
+    nobody = tick(READY, refused._replace(who=""))[1].events
+    assert Event("refused", "link", "the signature does not hold; said to be by nobody known") in nobody
+
+
+def test_a_release_of_the_watchdog_s_stop_is_told_and_moves_nothing() -> None:
+    for state in S:
+        before = at(state)
+        after, record = tick(before, Order("release", who="Ada"))
+        assert after.system is tick(before)[0].system
+        assert Event("release", "system", "order by Ada") in record.events
+
+
+def test_a_refusal_says_whose_order_it_was() -> None:
+    _, record = tick(at(S.FAULT), Order("arm", who="Ada", why="for fun"))
+    assert Event("refused", "arm", "not in FAULT; order by Ada") in record.events
+
+
 @pytest.mark.parametrize(
     ("samples_", "orders"),
     [((), ()), (((None,), ()), ()), ((("x",), ()), ()), (((), ()), ("arm",)), (((), (), ()), ()), (None, None)],
