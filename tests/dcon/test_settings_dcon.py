@@ -275,22 +275,22 @@ MISTAKES = {
     "operators without a port": (
         "[server]",
         "[server]\nlisten = 127.0.0.1",
-        "dcon.ini:35: [server] listen: ",
+        "dcon.ini:34: [server] listen: ",
     ),
     "operators over UDP": (
         "[server]",
         "[server]\nlisten = udp://127.0.0.1:4790",
-        "dcon.ini:35: [server] listen: udp://127.0.0.1:4790: operators connect to HOST:PORT, over TCP",
+        "dcon.ini:34: [server] listen: udp://127.0.0.1:4790: operators connect to HOST:PORT, over TCP",
     ),
     "orders that never grow old": (
         "[server]",
         "[server]\nwindow_s = 3600",
-        "dcon.ini:35: [server] window_s: 3600 is out of range; it must be 0.1 to 60",
+        "dcon.ini:34: [server] window_s: 3600 is out of range; it must be 0.1 to 60",
     ),
     "no backfill": (
         "[log]",
         "[log]\nbackfill_s = 0",
-        "dcon.ini:39: [log] backfill_s: 0 is out of range; it must be 1 to 3600",
+        "dcon.ini:38: [log] backfill_s: 0 is out of range; it must be 1 to 3600",
     ),
     "a line that is nothing": ("align = true", "align", "dcon.ini:27: 'align' is neither [section] nor key = value"),
 }
