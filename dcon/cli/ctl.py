@@ -125,7 +125,7 @@ def _line(status: dict[str, Any]) -> str:
     """One line of what changes."""
     if status.get("state") is None:
         return "no controller has been heard yet"
-    flags = " ".join(flag["name"] for flag in status["flags"] if flag["up"])
+    flags = " ".join(dict.fromkeys(flag["name"] for flag in status["flags"] if flag["up"]))
     return (
         f"{status['state']:<8} {status['mode']:<11} {status['active'] or '-':<10} "
         f"{status['command_mw']:8.2f} MW {status['output_v']:7.3f} V  log {_lag(status)}  {flags}".rstrip()

@@ -39,19 +39,14 @@ class News(NamedTuple):
 class Newest:
     """The last tick, the flag register and the last events of a session. Memory: bounded by the numbers above."""
 
-    def __init__(self) -> None:
-        self.head = Head("")
+    def __init__(self, head: Head) -> None:
+        self.head = head
         self.tick_ns = 0
         self.ticks = 0
         self.undecodable = 0
         self._last: dict[str, Any] = {}
         self._flags: dict[tuple[str, str], Any] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
-
-    def begin(self, head: Head) -> None:
-        """Another session."""
-        self.__init__()  # type: ignore[misc]
-        self.head = head
 
     def take(self, bundle: Bundle) -> News:
         """Take in a tick."""

@@ -24,6 +24,7 @@ CORRELATED = 0.5
 """Least correlation at which a lag is told."""
 STALE_NS = 2 * NS
 """The line has not reported for so long: nothing is known of it."""
+IMPLAUSIBLE_MW = 1e5
 FEWEST = 40
 """Reports of the line in the window."""
 MOST = 4096
@@ -50,11 +51,11 @@ class LineResponse:
         if self._command and tick_ns <= self._command[-1][0]:
             self._command.clear()  # the clock was set back: nothing before can be compared
             self._line.clear()
-        self._command.append((tick_ns, mw))
+        self._command.append((tick_ns, mw if abs(mw) < IMPLAUSIBLE_MW else 0.0))
 
     def line(self, time_ns: int, modulation_mw: float) -> None:
         """The line's power beside its schedule, as it was at ``time_ns``; one that is not newer is left out."""
-        if not np.isfinite(modulation_mw) or (self._line and time_ns <= self._line[-1][0]):
+        if not abs(modulation_mw) < IMPLAUSIBLE_MW or (self._line and time_ns <= self._line[-1][0]):
             return
         self._line.append((time_ns, modulation_mw))
 

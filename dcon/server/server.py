@@ -14,8 +14,7 @@ from typing import Any
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
-from dcon.link.keys import load_sequences, read_keys
-from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
+from dcon.link.keys import read_keys
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
 from dcon.server import words
@@ -25,7 +24,7 @@ from dcon.server.operators import Operators
 from dcon.server.recorder import MOST_PIECES, Recorder, Report
 from dcon.server.response import LineResponse, Response
 from dcon.server.scribe import Scribe
-from dcon.session.head import head_of
+from dcon.session.head import Head, head_of
 from dcon.settings import Settings
 from pmutools.clock import Clock, SystemClock
 from pmutools.timebase import NS
@@ -61,15 +60,9 @@ class Server:
         self.stopping = False
         self._notifier = notifier or Notifier({})
         keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
-        now_ns = self.clock.realtime_ns()
-        last = load_sequences(self.folder)
-        verifier = Verifier(
-            keys,
-            window_ns=round(settings.server.window_s * NS),
-            last=last,
-            floor_ns=now_ns if last is None else 0,
-        )
-        self.newest = Newest()
+        # it remembers no sequences of an earlier life: what was signed before this one is not told to the watchdog
+        verifier = Verifier(keys, window_ns=round(settings.server.window_s * NS), floor_ns=self.clock.realtime_ns())
+        self.newest = Newest(Head(""))
         self.response = LineResponse()
         self.report = Report()
         self.failures = 0
@@ -261,11 +254,12 @@ class Server:
             return
         self._pieces = []
         self._source = sock
+        known = piece.session == self._session and head == self.newest.head
         if piece.session != self._session:
             self._session, self._queued = piece.session, -1
-        if head != self.newest.head:
+        if not known:
             self._more = []
-            self.newest.begin(head)
+            self.newest = Newest(head)
             self.response = LineResponse()
 
     def _look(self, tick: Bundle, utc_ns: int) -> None:

@@ -13,10 +13,15 @@ from support.sessions import CONFIGS, HEAD, T0
 from support.shipped import FakeControl, recorder_in, same_ticks, tick_at
 
 from dcon.link.bundle import Bundle, Entry, Kind, decode
-from dcon.link.shipper import Ring
+from dcon.link.shipper import Ring, Shipper
 from dcon.server import state
 from dcon.server.recorder import Recorder
+from dcon.session.encode import tick_entries
+from dcon.session.head import Head
 from dcon.session.log import SessionReader
+from dcon.session.replay import replay
+from dcon.sim.plan import Plan
+from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run
 from pmutools.timebase import NS
 
@@ -252,6 +257,41 @@ def test_a_folder_that_cannot_be_written_is_tried_again(tmp_path: Path) -> None:
     back = list(reader.ticks())
     assert 0 < len(back) < 700 and back[-1].record.tick_ns == tick_at(799).record.tick_ns
     assert back[0].record.events[-1].detail.startswith(f"{800 - len(back)} ticks were not logged: ")
+
+
+def test_a_session_of_several_lives_replays_bit_for_bit(tmp_path: Path) -> None:
+    """From the bytes of a simulated session, through bundles, deaths and backfill, to a replay without a difference."""
+    simulate(Plan(gain_mw_per_mhz=12, duration_s=4), str(tmp_path / "simulated.mcap"))
+    source = SessionReader(tmp_path / "simulated.mcap")
+    metadata = {key: source.metadata[key] for key in ("scenario", "plant", "seed", "verified")}
+    head = Head(source.ini_text, source.pmus, source.instances, source.flags, metadata)
+    shipper = Shipper(5, head.pieces(5), Ring(600 * NS, 64 << 20))
+    for name, frame in source.configs.items():
+        shipper.config(name, frame, 0, 0)
+    recorder = recorder_in(tmp_path)
+
+    def take(data: bytes) -> bool:
+        bundle = decode(data)
+        assert bundle is not None
+        recorder.take(bundle)
+        return True
+
+    for number, tick in enumerate(source.ticks()):
+        if number % 100 == 0:
+            recorder = recorder_in(tmp_path)
+            session, have = recorder.resumes
+            shipper.told(json.dumps({"session": session, "have": have}).encode())
+        entries = tick_entries(source.instances, tick.record, tick.frames, tick.orders, pdci=tick.pdci)
+        shipper.tick(tick.record.tick_ns, entries, 0)
+        shipper.service(take)
+        if number % 37 == 0:
+            shipper.told(json.dumps({"ack": recorder.flush().have}).encode())
+    while shipper.service(take):
+        pass
+    recorder.close()
+    result = replay(tmp_path / "session.mcap")
+    assert len(SessionReader(tmp_path / "session.mcap").parts) == 3
+    assert (result.ticks, result.different, result.stopped, result.problems) == (240, 0, "", [])
 
 
 def test_a_log_of_two_lives_exports_without_a_gap(tmp_path: Path) -> None:
