@@ -12,8 +12,8 @@ import sys
 import time
 from contextlib import suppress
 
-from dcon.drivers.udp_command import CommandOut, encode
 from dcon.link.beats import LoopName, Verb, decode_status, encode_beat, encode_word
+from dcon.watchdog.codec import RELAYS, encode_command  # it starts faster than the driver's
 
 LOOPS = [LoopName(name) for name in ("control", "udp", "parse", "gps", "gui", "pdci")]
 PERIOD_NS = 10**9 // 60
@@ -34,10 +34,10 @@ def platform(folder: str, volts: float = 5.0) -> None:
                 status = decode_status(inbox.recv(64))
                 closed = status is not None and status.closed
         driven = volts if closed else 0.0
-        command = CommandOut(tick, time.time_ns(), driven * 12.5, driven, int(tick > 10))
+        command = encode_command(tick, time.time_ns(), driven * 12.5, driven, RELAYS if tick > 10 else 0)
         beats = [encode_beat(loop, tick, time.monotonic_ns()) for loop in LOOPS]
         with suppress(OSError):
-            for datagram in (encode(command), *beats):
+            for datagram in (command, *beats):
                 out.sendto(datagram, to)
         tick += 1
         time.sleep(max(0.0, (start_ns + tick * PERIOD_NS - time.monotonic_ns()) / 1e9))

@@ -562,7 +562,7 @@ class Watched(Bench):
         return False
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(ACTS, st.booleans())
 def test_no_sequence_of_news_closes_the_relays_while_a_cause_is_up(acts: list[tuple[str, Any]], warm: bool) -> None:
     bench = Watched()
@@ -584,7 +584,7 @@ def test_a_trip_survives_everything_but_a_reset(acts: list[tuple[str, Any]]) -> 
     assert all(volts == 0.0 for _, volts in bench.left[-3:])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(ACTS)
 def test_the_same_news_give_the_same_decisions(acts: list[tuple[str, Any]]) -> None:
     benches = [Bench().closed() for _ in range(2)]
@@ -609,7 +609,7 @@ ITEMS = st.one_of(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.lists(ITEMS, max_size=8), st.integers(-100, 10_000)), max_size=30))
 def test_no_news_makes_it_raise_or_drive_too_much(rounds: list[tuple[list[Item], int]]) -> None:
     memory, now_ns = Bench().closed(5.0).memory, 6_000_000_000
