@@ -12,7 +12,7 @@ the bus are looked at by who opens them (:mod:`dcon.drivers`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TypeVar
 from urllib.parse import parse_qsl, urlsplit
 
@@ -60,7 +60,7 @@ class IioPlace:
     keys: IioKeys = IioKeys()
 
     def __str__(self) -> str:
-        return f"iio://{self.folder}?channel={self.keys.channel}"
+        return f"iio://{self.folder}?{_query(self.keys)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class ModbusPlace:
     keys: OutputRegisters = OutputRegisters()
 
     def __str__(self) -> str:
-        return f"modbus://{join_host(self.host, self.port)}?unit={self.keys.unit}&register={self.keys.register}"
+        return f"modbus://{join_host(self.host, self.port)}?{_query(self.keys)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +134,7 @@ class ModbusLine:
     keys: StatusRegisters = StatusRegisters()
 
     def __str__(self) -> str:
-        return f"modbus://{join_host(self.host, self.port)}?unit={self.keys.unit}&power={self.keys.power}"
+        return f"modbus://{join_host(self.host, self.port)}?{_query(self.keys)}"
 
 
 Destination = Endpoint | IioPlace | ModbusPlace
@@ -187,6 +187,13 @@ def _modbus(text: str, keys: type[Keys]) -> tuple[str, int, Keys]:
     if not parts.hostname or parts.username is not None or parts.path not in ("", "/") or parts.fragment:
         raise ValueError(f"{text}: only modbus://HOST:PORT?key=value is understood")
     return parts.hostname, port, _keys(keys, text, parts.query)
+
+
+def _query(keys: IioKeys | OutputRegisters | StatusRegisters) -> str:
+    """All keys in force."""
+    values = ((item.name, getattr(keys, item.name)) for item in fields(keys))
+    shown = ((name, f"{value:g}" if isinstance(value, float) else value) for name, value in values)
+    return "&".join(f"{name}={value}" for name, value in shown if value is not None)
 
 
 def _keys(cls: type[T], url: str, query: str) -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 
 import click
@@ -22,11 +23,17 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
     from dcon.link.paths import prepare
     from dcon.platform.output import OutputProcess
     from dcon.settings import load
+    from pmutools.realtime import go_realtime
 
     talk = Talk(quiet, verbose)
     settings = load(ini)
     process = OutputProcess(settings.output, prepare(run_dir))
     before = {number: signal.signal(number, lambda *_: process.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
+    missing = go_realtime(
+        fifo=settings.platform.fifo
+    )  # a thread that talks to a bus is there already, and stays as it is
+    if missing.fifo:
+        talk.say(f"running at the normal scheduling policy: {missing.fifo}")
     talk.say(f"driving {settings.output.url}; Ctrl-C ends")
     try:
         process.run()
@@ -34,10 +41,14 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
         for number, handler in before.items():
             signal.signal(number, handler)
     outlet, driver = process.outlet, process.driver
-    refused = ", ".join(f"{count} {why}" for why, count in sorted(outlet.refused.items()) if count)
-    said = f"{outlet.commands} commands, {process.readbacks} read back, {outlet.holds} times to 0 V for want of one"
+    refused = {why: count for why, count in sorted(outlet.refused.items()) if count}
+    if as_json:
+        summary = {"commands": outlet.commands, "readbacks": process.readbacks, "holds": outlet.holds}
+        click.echo(json.dumps(summary | {"refused": refused, "failed": driver.failed, "trouble": driver.trouble}))
+    words = ", ".join(f"{count} {why}" for why, count in refused.items()) or "none"
     talk.say(
-        said + (f"; refused: {refused}" if refused else "") + (f"; {driver.failed} failures" if driver.failed else "")
+        f"{outlet.commands} commands, {process.readbacks} read back, {outlet.holds} times to 0 V for want of one; "
+        f"refused: {words}; {driver.failed} failures"
     )
     if driver.trouble:
         talk.complain(f"the output may not be at 0 V: {driver.trouble}")

@@ -47,7 +47,7 @@ from pmutools.net.endpoint import Endpoint
 from pmutools.net.sockets import explain, resolve
 from pmutools.timebase import NS
 
-LOG = logging.getLogger(__name__)
+LOG = logging.getLogger("dcon.platform.aides")  # also as __main__
 ROUND_S = 0.1
 """Longest wait of a loop."""
 TELL_NS = NS

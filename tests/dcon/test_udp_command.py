@@ -116,7 +116,5 @@ def test_it_is_a_driver_that_reads_nothing_back_and_leaves_0_v(receiver: socket.
 
 
 def test_what_needs_a_process_of_its_own_is_not_driven_from_the_loop() -> None:
-    with pytest.raises(
-        SettingsError, match=r"^\[output\] iio:///x\?channel=0: driven by a process of its own, dcon output"
-    ):
+    with pytest.raises(SettingsError, match=r"^\[output\] iio:///x\?\S+: driven by a process of its own, dcon output"):
         UdpCommandDriver(IioPlace("/x"))

@@ -6,6 +6,7 @@ import contextlib
 import math
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from support.requires import requires_module
 from dcon.drivers.modbus import Bus, BusError, from_registers, to_registers
 from dcon.drivers.modbus_output import ModbusDriver
 from dcon.places import ModbusPlace, OutputRegisters
+from pmutools.errors import SettingsError
 
 pytestmark = pytest.mark.realtime
 
@@ -150,6 +152,14 @@ def test_answers_that_are_none(reply: Callable[[bytes], bytes]) -> None:
             bus.words(0, 2)
         assert time.monotonic() - began < 1
         bus.close()
+
+
+def test_without_pymodbus_it_is_one_line_that_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymodbus.client", None)
+    with pytest.raises(
+        SettingsError, match=r"^modbus:// needs pymodbus; install it with: pip install 'pmutools\[modbus\]'$"
+    ):
+        ModbusDriver(ModbusPlace("127.0.0.1", 502))
 
 
 # --- the driver --------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -74,12 +75,11 @@ def test_it_goes_to_0_v_by_itself(tmp_path: Path, folder: Path) -> None:
     (device / "out_voltage0_raw").write_text("1234")
     with driving(iio_output(device, 60.0), folder) as process:
         wait_for(lambda: counts_or_none(device) == ZERO)
-        send(folder, OUTPUT, command(1, 5.0))
-        wait_for(lambda: counts_or_none(device) == FIVE)
+        drive_until(folder, device, 5.0, FIVE)
         began = time.monotonic()
         wait_for(lambda: counts_or_none(device) == ZERO)
         assert time.monotonic() - began < 1
-        assert process.outlet.holds == 1
+        assert process.outlet.holds >= 1
 
 
 def counts_or_none(device: Path) -> int | None:
@@ -88,6 +88,20 @@ def counts_or_none(device: Path) -> int | None:
         return counts(device)
     except ValueError:
         return None
+
+
+def drive_until(folder: Path, device: Path, volts: float, expected: int) -> None:
+    """Command again and again, as a controller does: what came while the process had no processor is not driven."""
+    sequence = 0
+
+    def driven() -> bool:
+        nonlocal sequence
+        sequence += 1
+        send(folder, OUTPUT, command(sequence, volts))
+        time.sleep(0.01)
+        return counts_or_none(device) == expected
+
+    wait_for(driven)
 
 
 def test_what_is_not_let_through_is_0_v_and_nonsense_is_counted(tmp_path: Path, folder: Path) -> None:
@@ -184,7 +198,7 @@ def test_what_needs_no_such_process(url: str | None, message: str, folder: Path)
 def command_line(device: Path, run_dir: Path, hold_ms: int = 100) -> Iterator[subprocess.Popen[str]]:
     ini = device.parent / "dcon.ini"
     ini.write_text(f"{PMUS}[output]\nurl = iio://{device}?readback=0\nhold_ms = {hold_ms}\n")
-    arguments = [sys.executable, "-m", "dcon.cli", "output", "--ini", str(ini), "--run-dir", str(run_dir)]
+    arguments = [sys.executable, "-m", "dcon.cli", "output", "--json", "--ini", str(ini), "--run-dir", str(run_dir)]
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         wait_for(lambda: is_socket(run_dir / OUTPUT) or process.poll() is not None)
@@ -201,9 +215,11 @@ def test_ended_it_leaves_0_v_and_killed_it_leaves_the_last_value(tmp_path: Path)
         send(run_dir, OUTPUT, command(1, 5.0))
         wait_for(lambda: counts_or_none(device) == FIVE)
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=10)
+        data, said = process.communicate(timeout=10)
         assert process.returncode == 0, said
         assert "1 commands, 1 read back" in said and counts(device) == ZERO
+        summary = json.loads(data)
+        assert (summary["commands"], summary["readbacks"], summary["failed"], summary["trouble"]) == (1, 1, 0, "")
     with command_line(device, run_dir, 1000) as process:
         send(run_dir, OUTPUT, command(1, 5.0))
         wait_for(lambda: counts_or_none(device) == FIVE)
@@ -217,17 +233,17 @@ def test_ended_it_leaves_0_v_and_killed_it_leaves_the_last_value(tmp_path: Path)
 def test_stopped_and_continued_it_does_not_drive_what_had_queued(tmp_path: Path) -> None:
     device, run_dir = iio_device(tmp_path), tmp_path / "run"
     with command_line(device, run_dir, 100) as process:
-        send(run_dir, OUTPUT, command(1, 1.0))
-        wait_for(lambda: counts_or_none(device) == 36045)
+        drive_until(run_dir, device, 1.0, 36045)
         process.send_signal(signal.SIGSTOP)
-        for sequence in range(2, 6):
+        wait_for(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
+        for sequence in range(10_000, 10_004):
             send(run_dir, OUTPUT, command(sequence, 5.0))
         time.sleep(0.3)  # longer than it may hold
         process.send_signal(signal.SIGCONT)
         wait_for(lambda: counts_or_none(device) == ZERO)
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=10)
-        assert "4 slept" in said
+        data, _ = process.communicate(timeout=10)
+        assert json.loads(data)["refused"]["slept"] >= 4
 
 
 def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,11 +11,13 @@ def test_what_urls_mean() -> None:
     iio = destination("iio:///sys/bus/iio/devices/iio:device0?channel=1&readback=3&adc=/sys/x&bits=16&settle_ms=0.5")
     assert isinstance(iio, IioPlace) and iio.folder == "/sys/bus/iio/devices/iio:device0"
     assert (iio.keys.channel, iio.keys.readback, iio.keys.adc, iio.keys.bits) == (1, 3, "/sys/x", 16)
-    assert str(iio) == "iio:///sys/bus/iio/devices/iio:device0?channel=1"
+    assert str(iio) == ("iio:///sys/bus/iio/devices/iio:device0?channel=1&readback=3&adc=/sys/x&bits=16&settle_ms=0.5")
     modbus = destination("modbus://192.0.2.7?unit=3&register=9&type=float32&readback=20")
     assert isinstance(modbus, ModbusPlace) and (modbus.host, modbus.port) == ("192.0.2.7", 502)
     assert (modbus.keys.unit, modbus.keys.register, modbus.keys.readback, modbus.keys.counts_per_v) == (3, 9, 20, 1.0)
-    assert str(destination("modbus://[::1]:1502")) == "modbus://[::1]:1502?unit=1&register=0"
+    assert str(destination("modbus://[::1]:1502")) == (
+        "modbus://[::1]:1502?unit=1&register=0&type=int16&timeout_ms=200"
+    )
     line = line_source("modbus://192.0.2.7:1502?power=2&scheduled=6&status=8&counter=9")
     assert isinstance(line, ModbusLine) and (line.keys.power, line.keys.scheduled, line.keys.counter) == (2, 6, 9)
     assert (
