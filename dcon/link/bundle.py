@@ -27,6 +27,8 @@ UNNUMBERED = (1 << 64) - 1
 
 
 class Kind(IntEnum):
+    """What a bundle is."""
+
     TICK = 0
     HEAD = 1
     """A piece of what the session is: the whole of them is read by :func:`joined`."""
@@ -48,6 +50,8 @@ class Entry(NamedTuple):
 
 
 class Bundle(NamedTuple):
+    """Entries of the log that go together."""
+
     kind: Kind
     sequence: int
     session: int
@@ -61,6 +65,7 @@ class Bundle(NamedTuple):
 
 
 def encode(bundle: Bundle) -> bytes:
+    """The message of a bundle."""
     kind, sequence, session, tick_ns, entries = bundle
     parts = [_HEAD.pack(MAGIC, sequence, session, tick_ns, len(entries), kind)]
     for message, name, data, log_time_ns, publish_time_ns in entries:

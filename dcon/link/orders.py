@@ -29,6 +29,8 @@ _NS = 1_000_000_000
 
 
 class SignedOrder(NamedTuple):
+    """An order, who signed it, and when."""
+
     who: str
     sequence: int
     """Greater than that of any order of the operator before; ``time_ns`` will do."""
@@ -72,6 +74,7 @@ def sign(order: SignedOrder, key: bytes) -> bytes:
 
 
 def mac_of(order: SignedOrder, key: bytes) -> str:
+    """64 hexadecimal digits."""
     return hmac.new(key, _canonical(order._asdict()), hashlib.sha256).hexdigest()
 
 

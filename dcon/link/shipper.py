@@ -19,6 +19,8 @@ BUNDLES_A_CALL = 8
 
 
 class Kept(NamedTuple):
+    """A bundle in the ring, and when it came (monotonic)."""
+
     sequence: int
     at_ns: int
     data: bytes
