@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.live import free_udp_port
+from support.running import descendants
 
 from dcon.cli import dcon
 from dcon.core.values import Pdci
@@ -225,10 +226,6 @@ def test_the_grid_tells_the_status_of_its_line() -> None:
 LONG = ["-c", "import time; time.sleep(60)"]
 
 
-def children(pid: int) -> list[int]:
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("failing", "said"),
@@ -253,11 +250,26 @@ def test_a_child_that_fails_is_told_and_the_other_is_ended(
     monkeypatch.setattr(conductor, "_launch", launched)
     monkeypatch.setattr(conductor, "_grid", lambda *args: failing if who == "grid" else LONG)
     monkeypatch.setattr(conductor, "_controller", lambda *args: failing if who == "controller" else LONG)
+    monkeypatch.setattr(conductor, "_await_controller", lambda *args: None)
     began = time.monotonic()
     with pytest.raises(DemoError, match=rf"^the {who} process failed: .*{said}$"):
         perform(Demo(tmp_path, course=SHORT))
     assert time.monotonic() - began < 4  # it was asked to end, not waited for
     assert len(started) == 2 and all(process.poll() is not None for process in started)
+
+
+@pytest.mark.realtime
+def test_a_controller_that_fails_or_hangs_before_it_is_ready_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conductor, "WHOLE", True)
+    monkeypatch.setattr(conductor, "_controller", lambda *args: ["-c", "raise SystemExit('no keys')"])
+    with pytest.raises(DemoError, match=r"^the controller process failed: no keys$"):
+        perform(Demo(tmp_path, course=SHORT))
+    monkeypatch.setattr(conductor, "READY_S", 0.5)
+    monkeypatch.setattr(conductor, "_controller", lambda *args: LONG)
+    with pytest.raises(DemoError, match=r"^the controller is not ready after 0\.5 s"):
+        perform(Demo(tmp_path, course=SHORT))
 
 
 @pytest.mark.realtime
@@ -279,6 +291,7 @@ def test_a_processes_that_hang_are_given_up(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(conductor, "GRACE_S", -SHORT.end_s - 5.0)
     monkeypatch.setattr(conductor, "_grid", lambda *args: LONG)
     monkeypatch.setattr(conductor, "_controller", lambda *args: LONG)
+    monkeypatch.setattr(conductor, "_await_controller", lambda *args: None)
     with pytest.raises(DemoError, match="did not end in time"):
         perform(Demo(tmp_path, course=SHORT))
 
@@ -308,16 +321,16 @@ def test_a_mistake_is_told_before_anything_starts(
 @pytest.mark.realtime
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the children in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_ends_both_children(number: signal.Signals, tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_processes(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "dcon.cli", "demo", "--out", str(tmp_path), "--quiet"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as demo:
         try:
-            deadline = time.monotonic() + 20
-            while len(ended := children(demo.pid)) < 2 or not (tmp_path / "session.mcap").exists():
+            deadline = time.monotonic() + 60
+            while len(ended := list(descendants(demo.pid))) < 7 or not (tmp_path / "session.mcap").exists():
                 assert time.monotonic() < deadline and demo.poll() is None
                 time.sleep(0.05)
             demo.send_signal(number)
-            _, err = demo.communicate(timeout=15)
+            _, err = demo.communicate(timeout=40)
         finally:
             if demo.poll() is None:
                 os.killpg(demo.pid, signal.SIGKILL)
