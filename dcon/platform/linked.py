@@ -157,6 +157,7 @@ class ShippedLog:
         self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
         self._news, self._clock = news, clock
         self._shown: Watchdog | None = None
+        self._ticks = 0
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
@@ -177,6 +178,7 @@ class ShippedLog:
         now_ns = self._clock.monotonic_ns()
         self._shipping.shipper.tick(record.tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
+        self._ticks += 1
 
     def _is_due(self, watchdog: Watchdog) -> bool:
         shown = self._shown
@@ -186,14 +188,14 @@ class ShippedLog:
 
     @property
     def unlogged_ticks(self) -> int:
-        """Bundles that the server does not have, and cannot get any more."""
+        """Those that the server does not have, and cannot get any more."""
         ring = self._shipping.shipper.ring
-        return ring.dropped + len(ring)
+        return min(ring.dropped + len(ring), self._ticks)
 
     def close(self) -> None:
         shipper = self._shipping.shipper
         shipper.end(self._clock.monotonic_ns())
-        end_s = time.monotonic() + LAST_S
+        end_s = time.monotonic() + (LAST_S if shipper.sent else 0.0)  # of a server that was never there nothing comes
         while len(shipper.ring) and time.monotonic() < end_s:
             self._shipping.service(self._clock.monotonic_ns())
             time.sleep(0.01)

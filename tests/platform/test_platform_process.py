@@ -1,0 +1,84 @@
+"""``dcon platform --run-dir`` as a process: what it says where it cannot be, and how it ends without the others."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.live import free_udp_port
+from support.running import descendants
+from support.swing import Streams
+
+from dcon.link.paths import CONTROL, bind_datagram, is_held, prepare
+
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="run folders are Linux's"),
+]
+NAMES = ("N1", "S1")
+
+
+def platform(folder: Path, *arguments: str, ports: list[int] | None = None) -> subprocess.Popen[str]:
+    urls = [f"udp://127.0.0.1:{port}" for port in ports or [free_udp_port() for _ in NAMES]]
+    extra = "\n[platform]\nfifo = no\ntime_source = none\n"
+    (folder / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra=extra))
+    command = [sys.executable, "-m", "dcon.cli", "platform", "--ini", str(folder / "site.ini")]
+    command += ["--run-dir", str(folder / "run"), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def said(process: subprocess.Popen[str]) -> tuple[int, str]:
+    _, err = process.communicate(timeout=30)
+    return process.returncode, err
+
+
+def test_two_in_one_folder(tmp_path: Path) -> None:
+    with bind_datagram(prepare(tmp_path / "run"), CONTROL):
+        code, err = said(platform(tmp_path))
+    assert code == 1
+    assert (
+        err
+        == f"dcon: {tmp_path}/run/control.in: another process that is running has it; end that, or take another run folder\n"
+    )
+
+
+def test_a_folder_that_others_may_enter(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir(mode=0o755)
+    code, err = said(platform(tmp_path))
+    assert code == 1 and err.count("\n") == 1 and "chmod 700" in err
+
+
+def test_a_port_in_use_is_the_front_s_word_in_one_line(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = int(taken.getsockname()[1])
+        code, err = said(platform(tmp_path, ports=[port, free_udp_port()]))
+    assert code == 1 and err.count("\n") == 1 and f"udp://127.0.0.1:{port}" in err
+    assert not is_held(tmp_path / "run" / CONTROL)
+
+
+def test_a_log_has_no_place_in_a_run_folder(tmp_path: Path) -> None:
+    code, err = said(platform(tmp_path, "--log", "s.mcap"))
+    assert code == 2 and "the server writes the log" in err
+
+
+def test_it_ends_when_asked_to_while_it_still_waits_for_the_watchdog(tmp_path: Path) -> None:
+    process = platform(tmp_path, "--json")
+    end_s = time.monotonic() + 20
+    while len(mine := list(descendants(process.pid))) < 2 or not is_held(tmp_path / "run" / CONTROL):
+        assert time.monotonic() < end_s and process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    assert json.loads(out)["final_state"] == "INIT"
+    end_s = time.monotonic() + 5
+    while any(Path(f"/proc/{pid}").exists() for pid in mine):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
