@@ -103,17 +103,18 @@ def _session(
     from pmutools.clock import SystemClock
 
     clock = SystemClock(spin_ns=SPIN_NS)
-    if folder is None:
-        from dcon.platform.alone import own_ends
+    with _Signals() as signals:
+        if folder is None:
+            from dcon.platform.alone import own_ends
 
-        ends = own_ends(settings, clock, log_path)
-    else:
-        from dcon.link.paths import prepare
-        from dcon.platform.linked import Linked
+            ends = own_ends(settings, clock, log_path)
+        else:
+            from dcon.link.paths import prepare
+            from dcon.platform.linked import Linked
 
-        ends = Linked(settings, ini, prepare(folder), clock).ends
-    platform = Platform(settings, ends, clock, ticked=_Herald(notifier))
-    with _stopped_by_signals(platform):
+            ends = Linked(settings, ini, prepare(folder), clock).ends
+        platform = Platform(settings, ends, clock, ticked=_Herald(notifier))
+        signals.concern(platform)
         yield platform
 
 
@@ -137,16 +138,29 @@ class _Herald:
         self._notifier.tell(*((READY,) if first else ()), ALIVE, status=status)
 
 
-@contextmanager
-def _stopped_by_signals(platform: Platform) -> Iterator[None]:
-    def stop(signum: int, frame: FrameType | None) -> None:
-        if platform.stopping:
-            raise KeyboardInterrupt
-        platform.stop()
+class _Signals:
+    """SIGINT and SIGTERM ask the platform to stop, as soon as there is one; a second one interrupts."""
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def __init__(self) -> None:
+        self._asked = False
+        self._platform: Platform | None = None
+
+    def concern(self, platform: Platform) -> None:
+        self._platform = platform
+        if self._asked:
+            platform.stop()
+
+    def _ask(self, signum: int, frame: FrameType | None) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked = True
+        if self._platform is not None:
+            self._platform.stop()
+
+    def __enter__(self) -> _Signals:
+        self._before = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for each, handler in self._before.items():
+            signal.signal(each, handler)
