@@ -23,6 +23,8 @@ LONGEST = 4000
 WORDS = 200
 """Characters of ``who``, ``text`` and ``why``, each."""
 WINDOW_NS: Final = 5_000_000_000
+ANSWER_NS: Final = 2_000_000_000
+"""An order that the controller has not spoken of for so long is answered with that."""
 REFUSALS_A_SECOND = 10
 """Refused orders that become inputs; more are counted."""
 _NS = 1_000_000_000

@@ -8,14 +8,13 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
-from dcon.link.orders import Operator, SignedOrder, sign
-from dcon.server.pending import PATIENCE_NS
+from dcon.link.orders import ANSWER_NS
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, join_host
 from pmutools.timebase import NS
 
 CONNECT_S = 3.0
-ANSWER_S = PATIENCE_NS / NS + 3.0
+PATIENCE_S = ANSWER_NS / NS + 3.0
 LONGEST_ANSWER = 1 << 20
 
 
@@ -42,7 +41,7 @@ class Client:
             self._sock = socket.create_connection((where.host, where.port), CONNECT_S)
         except OSError as error:
             raise SourceError(f"{self._name}: {error.strerror or error}; is dcon server running there?") from None
-        self._sock.settimeout(ANSWER_S)
+        self._sock.settimeout(PATIENCE_S)
 
     def ask(self, asked: dict[str, Any]) -> dict[str, Any]:
         """Send, and await the answer."""
@@ -74,7 +73,7 @@ class Client:
             try:
                 data = self._sock.recv(65536)
             except TimeoutError:
-                raise SourceError(f"{self._name}: no answer in {ANSWER_S:g} s") from None
+                raise SourceError(f"{self._name}: no answer in {PATIENCE_S:g} s") from None
             except OSError as error:
                 raise SourceError(f"{self._name}: {error.strerror or error}") from None
             if not data:

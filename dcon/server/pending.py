@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 from dcon.core.orders import SYSTEM
 from dcon.core.system import LINK_REFUSED
 from dcon.core.values import Order
-from dcon.link.orders import Refused, digest, read
+from dcon.link.orders import ANSWER_NS, Refused, digest, read
 from dcon.server.newest import News
 
-PATIENCE_NS = 2_000_000_000
 MOST = 256
 """On their way at once."""
 
@@ -34,7 +33,7 @@ class _Waiting(NamedTuple):
 
 
 class Pending:
-    """Every order that is added is answered, after ``PATIENCE_NS`` at the latest."""
+    """Every order that is added is answered, after ``ANSWER_NS`` at the latest."""
 
     def __init__(self) -> None:
         self._waiting: list[_Waiting] = []
@@ -50,7 +49,7 @@ class Pending:
         """An order was relayed; ``now_ns`` on a clock without steps."""
         said = read(signed)
         order = None if isinstance(said, Refused) else said.order
-        self._waiting.append(_Waiting(asker, digest(signed), order, now_ns + PATIENCE_NS, told))
+        self._waiting.append(_Waiting(asker, digest(signed), order, now_ns + ANSWER_NS, told))
 
     def awaits(self, asker: Hashable) -> bool:
         return any(waiting.asker == asker for waiting in self._waiting)
@@ -90,7 +89,7 @@ class Pending:
         """Those that the controller has not spoken of in time."""
         late = [waiting for waiting in self._waiting if now_ns >= waiting.due_ns]
         self._waiting = [waiting for waiting in self._waiting if now_ns < waiting.due_ns]
-        silence = f"the controller has not answered in {PATIENCE_NS // 10**9} s"
+        silence = f"the controller has not answered in {ANSWER_NS // 10**9} s"
         return [Answer(waiting.asker, {"unknown": silence + waiting.told}) for waiting in late]
 
     def forget(self, asker: Hashable) -> None:
