@@ -124,7 +124,16 @@ class Household:
             os.write(self._woken, b"\0")
 
     def run(self) -> Outcome:
-        """Until the controller's time is over, or :meth:`stop`. Raises SourceError where a process cannot start."""
+        """Until the controller's time is over, or :meth:`stop`.
+
+        Raises SourceError where a process cannot start, or one that runs already has its place.
+        """
+        for each in self._running.values():
+            path = self.folder / each.member.inbox
+            if paths.is_held(path, each.member.kind):
+                raise SourceError(
+                    f"{path}: another process that is running has it; end that, or take another run folder"
+                )
         try:
             for each in self._running.values():
                 self._start(each)
@@ -169,7 +178,7 @@ class Household:
         assert each.process is not None
         end_s = time.monotonic() + START_S
         path = self.folder / each.member.inbox
-        while not paths.is_held(path, each.member.kind):
+        while not paths.is_held(path, each.member.kind) or each.process.poll() is not None:
             if self.stopping:
                 return False
             if each.process.poll() is not None:
@@ -242,6 +251,7 @@ class Household:
 
     def _ask_to_end(self, each: _Running) -> None:
         assert each.process is not None
+        self._notifier.tell(ALIVE)
         each.process.terminate()
         try:
             each.process.wait(each.member.patience_s)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dcon.link.notify import Notifier
-from dcon.link.paths import prepare
+from dcon.link.paths import CONTROL, bind_datagram, prepare
 from dcon.platform.household import ENDED, STARTED, Household
 from pmutools.errors import SourceError
 
@@ -142,6 +142,13 @@ def test_one_that_cannot_start_ends_the_others_in_one_line(tmp_path: Path) -> No
     assert house.events("start") == ["watchdog"] and house.is_empty()
 
 
+def test_a_second_run_in_one_folder_is_refused_and_disturbs_nobody(tmp_path: Path) -> None:
+    house = House(tmp_path)
+    with bind_datagram(house.folder, CONTROL), pytest.raises(SourceError, match=r"control.in: another process that is"):
+        house.household.run()
+    assert house.events("start") == []
+
+
 def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     house = House(tmp_path)
     house.deaf = "server"
@@ -177,7 +184,8 @@ def test_systemd_is_told(tmp_path: Path) -> None:
                 rest.append(service.recv(100))
             except BlockingIOError:
                 break
-    assert rest[-1] == b"STOPPING=1\nSTATUS=ending" and set(rest[:-1]) <= {b"WATCHDOG=1\nSTATUS=running"}
+    at = rest.index(b"STOPPING=1\nSTATUS=ending")
+    assert set(rest[:at]) <= {b"WATCHDOG=1\nSTATUS=running"} and set(rest[at + 1 :]) == {b"WATCHDOG=1"}
 
 
 ALONE = """

