@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -174,7 +175,7 @@ def test_systemd_is_told(tmp_path: Path) -> None:
         service.bind(str(tmp_path / "notify"))
         service.settimeout(5)
         house.household._notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")})
-        house.stop_when(lambda: len(house.events("start")) == 3)
+        house.stop_when(lambda: bool(select.select([service], [], [], 0)[0]))
         house.household.run()
         assert service.recv(100) == b"READY=1\nSTATUS=running"
         rest = []
