@@ -71,6 +71,8 @@ class Failure(NamedTuple):
 
 
 Item = PmuFrameIn | LinkEvent | Counts | Failure
+_NEWS = ("kind", "where", "detail", "datagrams", "label")
+"""What of a LinkEvent crosses."""
 
 
 def encode(items: Iterable[Item]) -> Iterator[tuple[bytes, list[Item]]]:
@@ -97,7 +99,7 @@ def _record(item: Item) -> bytes:
             source = _SOURCE_NUMBERS[frame.stamp_source]
             return _HEAD.pack(kind, source, pmu, frame.arrival_ns or 0, len(frame.data)) + frame.data
         case LinkEvent():
-            said = {"kind": item.kind, "where": item.where, "detail": item.detail, "datagrams": item.datagrams}
+            said = {name: getattr(item, name) for name in _NEWS}
             return _text(Kind.NEWS, json.dumps(said))
         case Counts():
             return _text(Kind.COUNTS, json.dumps(asdict(item)))
@@ -140,5 +142,5 @@ def decode(message: bytes) -> Iterator[Item]:
 
 def _said(kind: Kind, said: dict[str, Any]) -> LinkEvent | Counts:
     if kind == Kind.NEWS:
-        return LinkEvent(LinkKind(said["kind"]), said["where"], (), said["detail"], datagrams=said["datagrams"])
+        return LinkEvent(**said | {"kind": LinkKind(said["kind"]), "owners": ()})
     return Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})

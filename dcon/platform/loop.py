@@ -237,7 +237,7 @@ class Platform:
     def _tell(self, news: LinkEvent) -> None:
         self._told[news.kind] += 1
         level = logging.WARNING if news.kind in TROUBLE and self._told[news.kind] <= TOLD else logging.INFO
-        LOG.log(level, "%s: %s %s", news.where, news.kind, news.detail)
+        LOG.log(level, "%s: %s %s", news.label or news.where, news.kind, news.detail)
 
     def _configure(self, name: str, frame: Frame) -> None:
         engine = self.engine

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from dcon.cli.watchdog import arguments
-from dcon.settings import Settings, Watchdog, effective, parse
+from dcon.effective import effective
+from dcon.settings import Settings, Watchdog, parse
 from dcon.watchdog.__main__ import config_of
 from dcon.watchdog.files import Lines
 from dcon.watchdog.limits import BOUNDS, Limits, Rules
@@ -72,7 +73,7 @@ def test_every_limit_is_a_key_with_its_bounds() -> None:
         for bad in (low - 1, high * 2):
             with pytest.raises(SettingsError, match=rf"\[watchdog\] {name}: .* is out of range; it must be {low:g} to"):
                 settings(f"[watchdog]\n{name} = {bad!r}\n")
-    assert {key for section, key, _, _ in effective(settings("")) if section == "watchdog"} == keys
+    assert {row.key for row in effective(settings("")) if row.section == "watchdog"} == keys
 
 
 @pytest.mark.parametrize(
