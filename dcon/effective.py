@@ -56,6 +56,7 @@ def effective(settings: Settings) -> list[Effective]:
     for section, values in (
         ("supervisor", params.thresholds),
         ("probing", params.probing),
+        ("pdci", settings.line_input),
         ("pdci", params.line),
         ("platform", settings.platform),
         ("watchdog", settings.watchdog),

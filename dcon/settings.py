@@ -14,13 +14,14 @@ from dcon.core.params import Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
+from dcon.places import Destination, LineSource, destination, line_source
 from dcon.watchdog.codec import LOOPS
 from dcon.watchdog.limits import BOUNDS, Limits, Rules
 from pmutools.errors import SettingsError
-from pmutools.net.endpoint import Endpoint
+from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.parsers import Parser, boolean, choice, integer, number, parsed_by, suggestion, words
 from pmutools.settings import Entry, Ini, Section, fill, parse_ini
-from pmutools.sites import Site, read_ini, sites_of
+from pmutools.sites import Site, endpoint, read_ini, sites_of
 
 PARAMS = {item.name: item for item in fields(Params)}
 ELSEWHERE = frozenset(("pmus", "instances", "rate_hz", "thresholds", "line", "required", "probing"))
@@ -33,14 +34,9 @@ RATE_HZ = 60
 PROBE_BYTES = 16 << 20
 """Largest file of a probing signal."""
 TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
+_SEPARATORS = " ,()"
+"""In lists of instances."""
 T = TypeVar("T")
-
-
-def _destination(text: str) -> Endpoint:
-    where = endpoint(text)
-    if where.scheme is not Scheme.UDP or not where.port:
-        raise ValueError(f"{text}: commands leave as udp://HOST:PORT")
-    return where
 
 
 def _listening(text: str) -> Endpoint:
@@ -197,10 +193,12 @@ class Server:
 
     required: bool = field(default=False, metadata=parsed_by(boolean))
     """The server must be heard: without it no arming; a loss warns."""
+    listen: Endpoint = field(default=Endpoint(Scheme.TCP, "127.0.0.1", 4790), metadata=parsed_by(_listening))
+    """``HOST:PORT`` for operators. Orders are signed, what is told is not secret to who can connect."""
     keys: str | None = field(default=None, metadata=parsed_by(str))
-    """File of the operators' keys, which only its owner may read; without it nobody can order anything."""
+    """File of operators and their keys (``dcon keys``); without it nobody orders anything."""
     window_s: float = field(default=5.0, metadata=parsed_by(number(0.1, 60)))
-    """An order counts when its time is no further from now than this, either way."""
+    """An order's time may differ so much from the platform's clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,7 +342,7 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
     given = _numbers(Params, Section(section.name, section.where, entries), skip=ELSEWHERE)
     thresholds = _filled(Thresholds, ini.section("supervisor"))
     line = _filled(Line, _split(ini.section("pdci"), LineInput)[1])
-    instances = _every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
+    instances = every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
         entry = entries.get("gain_mw_per_mhz") or entries["gain_max_mw_per_mhz"]
@@ -446,37 +444,3 @@ def _priority(sites: tuple[Site, ...], priority: Entry) -> tuple[Pair, ...]:
     if not pairs:
         raise priority.where.error("lists no pair; write NORTH-SOUTH,NORTH-SOUTH,... or leave the key out")
     return tuple(pairs)
-
-
-def effective(settings: Settings) -> list[tuple[str, str, str, str]]:
-    """Every setting in force but those of single PMUs, for ``dcon check``: section, key, value with unit, source."""
-    rows = []
-    params = settings.params
-    sections: tuple[tuple[str, Any], ...] = (
-        ("controller", params),
-        ("supervisor", params.thresholds),
-        ("probing", params.probing),
-        ("pdci", settings.line_input),
-        ("pdci", params.line),
-        ("platform", settings.platform),
-        ("watchdog", settings.watchdog),
-        ("server", settings.server),
-        ("output", settings.output),
-        ("log", settings.log),
-    )
-    for section, values in sections:
-        left_out = {"controller": ELSEWHERE, "probing": ("samples",)}.get(section, ())
-        for item in fields(values):
-            if item.name not in left_out:
-                value = _shown(getattr(values, item.name), item.metadata.get("unit", ""))
-                rows.append((section, item.name, value, item.metadata.get("source", "")))
-        if section == "controller":
-            rows.append((section, "priority", ",".join(params.instance_names), ""))
-    return rows
-
-
-def _shown(value: object, unit: str) -> str:
-    if isinstance(value, tuple):
-        return ",".join(map(str, value))
-    text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
-    return f"{text.lower() if isinstance(value, bool) else text} {unit}".strip()

@@ -15,6 +15,8 @@ COMMANDS = {
     "check": ("dcon.cli.check", "Dry check of an initialisation file; prints every effective setting."),
     "run": ("dcon.cli.run", "Controller, watchdog, server and output, started and looked after."),
     "platform": ("dcon.cli.platform", "The real-time controller: PMU streams in, command out, session log."),
+    "output": ("dcon.cli.output", "The output process: commands from the watchdog to a DAC or a Modbus device."),
+    "watchdog": ("dcon.cli.watchdog", "Passes the command on while all is well; opens the relays when it is not."),
     "server": ("dcon.cli.server", "Writes the session log of a platform, and serves its operators."),
     "ctl": ("dcon.cli.ctl", "An operator's orders, and what the controller is doing."),
     "keys": ("dcon.cli.keys", "Make a key for a new operator."),

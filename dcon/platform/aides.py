@@ -226,7 +226,7 @@ class GuiAide(Aide):
         super().__init__(LoopName.GUI, run_dir)
         self._inbox = paths.bind_datagram(run_dir, paths.AIDE)
         self.gate = gate
-        self._run_dir = run_dir
+        self._run_dir = run_dir.resolve()
 
     def round(self) -> None:
         if not select.select([self._inbox], [], [], ROUND_S)[0]:
@@ -235,12 +235,12 @@ class GuiAide(Aide):
             passed = self.gate.take(self._inbox.recv(1 << 16), time.monotonic_ns(), time.time_ns())
             if passed.news is not None:
                 self.tell(passed.news)
-            if passed.reply_to:
+            if passed.reply is not None and passed.reply_to:
                 self._reply(Path(passed.reply_to), passed.reply)
 
     def _reply(self, where: Path, reply: dict[str, Any]) -> None:
         """To a name in the run folder only: who writes to this loop must not have it write elsewhere."""
-        if where.parent == self._run_dir:
+        if where.parent.resolve() == self._run_dir:
             sender = Sender(where)
             sender.send(json.dumps(reply).encode())
             sender.close()

@@ -29,7 +29,6 @@ from dcon.platform.schedule import TickGrid
 from dcon.platform.waiting import Waiting
 from dcon.session.codec import Timing
 from dcon.session.head import Head
-from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.c37118 import Frame, decode_config
 from pmutools.clock import Clock, UtcOffset, utc_offset

@@ -26,9 +26,10 @@ class Passed(NamedTuple):
 
     news: dict[str, Any] | None = None
     """For the control process."""
+    reply: dict[str, Any] | None = None
+    """For who handed it on: ``{"digest", "refused"}``. What was accepted shows in the log of the session."""
     reply_to: str = ""
-    """Path of the socket that wants to hear; "" is nobody's."""
-    reply: dict[str, Any] = {}  # noqa: RUF012  # never changed
+    """Path of the socket that wants to hear it."""
 
 
 class OrderGate:
@@ -60,18 +61,17 @@ class OrderGate:
             self.malformed += 1
             return Passed()
         found = self.verifier.verify(signed, utc_ns)
-        reply = {"kind": "reply", "digest": digest(signed), "accepted": True, "reason": ""}
         if isinstance(found, Refused):
             self.refused += 1
             told = self._refusals.order(found, signed, now_ns)
             news = None if told is None else _order(told)
-            return Passed(news, reply_to, {**reply, "accepted": False, "reason": found.reason})
+            return Passed(news, {"digest": digest(signed), "refused": found.reason}, reply_to)
         self.accepted += 1
         if not save_sequences(self._folder, self.verifier.last):
             LOG.warning("%s: cannot be written", self._folder / SEQUENCES)
             with suppress(OSError):  # better none than one that is behind
                 (self._folder / SEQUENCES).unlink()
-        return Passed(_order(found.order), reply_to, reply)
+        return Passed(_order(found.order))
 
 
 def _order(order: Order) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
-from dcon.link.orders import ANSWER_NS
+from dcon.link.orders import ANSWER_NS, Operator, SignedOrder, sign
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, join_host
 from pmutools.timebase import NS

@@ -15,6 +15,7 @@ from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
 from dcon.link.keys import read_keys
+from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
 from dcon.server import words

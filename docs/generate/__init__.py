@@ -16,6 +16,7 @@ from generate import (
     streams,
     structure,
     studies,
+    trials,
     watchdog,
 )
 

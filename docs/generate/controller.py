@@ -20,7 +20,7 @@ from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
 from dcon.drivers import line_status, udp_command
 from dcon.places import IioKeys, OutputRegisters, StatusRegisters
-from dcon.settings import ELSEWHERE, LineInput, Log, Output, Platform, Server, Site, Watchdog
+from dcon.settings import ELSEWHERE, LineInput, Log, Output, Platform, Server, Site
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
@@ -222,7 +222,6 @@ GENERATORS = {
     "settings-supervisor": lambda: numbers(Thresholds),
     "settings-probing": lambda: numbers(Probing, ("samples",)),
     "settings-pdci": lambda: f"{keys(LineInput)}\n\n{numbers(Line)}",
-    "settings-watchdog": lambda: keys(Watchdog),
     "settings-server": lambda: keys(Server),
     "settings-pmu": lambda: keys(Site),
     "settings-output": lambda: keys(Output),

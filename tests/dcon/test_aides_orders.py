@@ -21,10 +21,12 @@ from support.modbus_device import wait_for
 from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.link.keys import SEQUENCES, add_key, read_keys
-from dcon.link.orders import SignedOrder, digest, sign
+from dcon.link.orders import SignedOrder, Verifier, digest, sign
 from dcon.link.paths import AIDE, CONTROL, WATCHDOG, prepare
 from dcon.platform.aides import GuiAide
-from dcon.platform.order_gate import OrderGate
+from dcon.platform.order_gate import OrderGate, Passed
+from dcon.server.desk import Desk
+from dcon.server.server import REPLIES
 from pmutools.errors import SourceError
 from pmutools.timebase import NS
 
@@ -53,6 +55,11 @@ def datagram(order: bytes, reply_to: str = "") -> bytes:
     return json.dumps({"kind": "signed", "order": order.hex(), "reply_to": reply_to}).encode()
 
 
+def why_not(passed: Passed) -> str:
+    """Why an order was refused; "" where it was not."""
+    return "" if passed.reply is None else str(passed.reply["refused"])
+
+
 # --- the gate ----------------------------------------------------------------------------------------------------
 
 
@@ -67,8 +74,7 @@ def test_an_order_passes_with_all_that_it_says(folder: Path) -> None:
         "who": "ann",
         "why": "more damping",
     }
-    assert passed.reply_to == "/somewhere"
-    assert passed.reply == {"kind": "reply", "digest": digest(order), "accepted": True, "reason": ""}
+    assert passed.reply is None
 
 
 def test_what_is_refused_becomes_an_input_that_says_why(folder: Path) -> None:
@@ -81,10 +87,15 @@ def test_what_is_refused_becomes_an_input_that_says_why(folder: Path) -> None:
         (b"arm, please", "no signed order", ""),
     ):
         it = gate(folder)
-        passed = it.take(datagram(order), 0, UTC_NS)
-        assert passed.news is not None and passed.news["name"] == "link_refused" and passed.news["who"] == who
-        assert reason in passed.news["text"] and reason in passed.reply["reason"]
-        assert not passed.reply["accepted"] and it.refused == 1
+        passed = it.take(datagram(order, "/somewhere"), 0, UTC_NS)
+        assert (
+            passed.reply_to == "/somewhere"
+            and passed.news is not None
+            and passed.news["name"] == "link_refused"
+            and passed.news["who"] == who
+        )
+        assert reason in passed.news["text"] and it.refused == 1
+        assert passed.reply == {"digest": digest(order), "refused": passed.news["text"]}
 
 
 def test_no_more_than_ten_refusals_a_second_are_told_and_the_rest_is_counted(folder: Path) -> None:
@@ -98,12 +109,12 @@ def test_no_more_than_ten_refusals_a_second_are_told_and_the_rest_is_counted(fol
 def test_what_was_accepted_once_never_is_again_and_a_restart_does_not_forget(folder: Path) -> None:
     first, second = signed(folder, sequence=5), signed(folder, "disarm", sequence=6)
     it = gate(folder)
-    assert it.take(datagram(second), 0, UTC_NS).reply["accepted"]
+    assert why_not(it.take(datagram(second), 0, UTC_NS)) == ""
     for later in (it, gate(folder)):
         for order in (first, second):
-            assert "replayed" in later.take(datagram(order), 0, UTC_NS).reply["reason"]
+            assert "replayed" in why_not(later.take(datagram(order), 0, UTC_NS))
     assert json.loads((folder / SEQUENCES).read_text()) == {"ann": 6}
-    assert gate(folder).take(datagram(signed(folder, sequence=7)), 0, UTC_NS).reply["accepted"]
+    assert why_not(gate(folder).take(datagram(signed(folder, sequence=7)), 0, UTC_NS)) == ""
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"ann": "6"}', b"\xff\xfe", b'{"ann": 6.0}'])
@@ -115,16 +126,16 @@ def test_with_a_file_that_is_gone_or_damaged_only_what_is_signed_from_now_on_cou
     if content is not None:
         (folder / SEQUENCES).write_bytes(content)
     it = gate(folder, UTC_NS + NS)
-    assert "replayed" in it.take(datagram(signed(folder, sequence=5)), 0, UTC_NS + NS).reply["reason"]
-    assert it.take(datagram(signed(folder, sequence=5, time_ns=UTC_NS + NS + 1)), 0, UTC_NS + NS).reply["accepted"]
+    assert "replayed" in why_not(it.take(datagram(signed(folder, sequence=5)), 0, UTC_NS + NS))
+    assert why_not(it.take(datagram(signed(folder, sequence=5, time_ns=UTC_NS + NS + 1)), 0, UTC_NS + NS)) == ""
     assert json.loads((folder / SEQUENCES).read_text()) == {"ann": 5}
 
 
 def test_where_nothing_can_be_written_orders_pass_and_no_old_file_stays(folder: Path) -> None:
     it = gate(folder)
-    assert it.take(datagram(signed(folder, sequence=5)), 0, UTC_NS).reply["accepted"]
+    assert why_not(it.take(datagram(signed(folder, sequence=5)), 0, UTC_NS)) == ""
     (folder / f"{SEQUENCES}.new").mkdir()
-    assert it.take(datagram(signed(folder, "estop", sequence=6)), 0, UTC_NS).reply["accepted"]
+    assert why_not(it.take(datagram(signed(folder, "estop", sequence=6)), 0, UTC_NS)) == ""
     assert not (folder / SEQUENCES).exists()
 
 
@@ -142,7 +153,7 @@ def test_other_datagrams_are_counted(data: bytes | str) -> None:
 
 def test_without_keys_nobody_can_order(folder: Path) -> None:
     passed = OrderGate({}, WINDOW_S, folder, UTC_NS - NS).take(datagram(signed(folder)), 0, UTC_NS)
-    assert passed.reply["reason"] == "unknown operator"
+    assert why_not(passed) == "unknown operator"
 
 
 # --- the loop ----------------------------------------------------------------------------------------------------
@@ -158,17 +169,38 @@ def test_the_loop_passes_on_and_replies_within_the_folder_only(folder: Path, tmp
         with elsewhere, in_thread(aide.run, aide.stop):
             now = time.time_ns()
             send(folder, AIDE, b"nonsense")
-            send(folder, AIDE, datagram(signed(folder, time_ns=now), str(tmp_path / "elsewhere")))
+            send(folder, AIDE, datagram(signed(folder, time_ns=now)))
+            for away in ("elsewhere", "run/../elsewhere"):
+                send(folder, AIDE, datagram(signed(folder, time_ns=now), str(tmp_path / away)))
             send(folder, AIDE, datagram(signed(folder, time_ns=now), str(folder / "server.reply")))
-            wait_for(lambda: len(control.said("order")) == 2 and server.said("reply"))
-            assert [news["name"] for news in control.said("order")] == ["arm", "link_refused"]
-            assert server.said("reply")[0]["reason"].startswith("replayed")
+            wait_for(lambda: len(control.said("order")) == 4 and server.heard)
+            assert [news["name"] for news in control.said("order")] == ["arm", *3 * ["link_refused"]]
+            assert json.loads(server.heard[0][1])["refused"].startswith("replayed")
             with pytest.raises(BlockingIOError):
                 elsewhere.recv(100)
             assert aide.gate.malformed == 1
             wait_for(lambda: len(watchdog.beats("gui")) > 5)
         with pytest.raises(FileNotFoundError):
             send(folder, AIDE, b"")
+
+
+@pytest.mark.realtime
+def test_the_server_hears_why_an_order_of_its_operator_was_refused(folder: Path) -> None:
+    operators = read_keys(folder / "keys")
+    with listening(folder, CONTROL, REPLIES) as (control, replies):
+        aide = GuiAide(gate(folder, time.time_ns()), folder)
+        desk = Desk(folder, operators, dict, Verifier(operators))
+        desk.reply_to = str(folder / REPLIES)
+        with in_thread(aide.run, aide.stop):
+            order = signed(folder, time_ns=time.time_ns())
+            for asker in ("first", "second"):
+                ask = json.dumps({"signed": order.decode()}).encode()
+                assert desk.ask(asker, ask, utc_ns=time.time_ns(), now_ns=time.monotonic_ns()) is None
+            wait_for(lambda: replies.heard)
+            assert len(control.said("order")) == 2
+            (answer,) = desk.reply(replies.heard[0][1])[:1]
+        desk.close()
+    assert "replayed" in json.dumps(answer)
 
 
 @pytest.mark.realtime

@@ -9,8 +9,9 @@ import pytest
 
 from dcon.cli import dcon
 from dcon.core.params import Pair, Params, Thresholds
+from dcon.effective import effective
 from dcon.places import IioPlace
-from dcon.settings import effective, load, parse
+from dcon.settings import load, parse
 from pmutools.cli.shell import run
 from pmutools.errors import SettingsError, SourceError
 from pmutools.net.endpoint import Endpoint
