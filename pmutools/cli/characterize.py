@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmutools import parsers
-from pmutools.cli.shell import Exit, Parsed, Talk, common, interruptible
+from pmutools.cli.shell import Exit, Parsed, Talk, common, interruptible, visible
 from pmutools.cli.sources import DURATION, is_live
 from pmutools.errors import SettingsError, SourceError
 from pmutools.timebase import NS
@@ -295,7 +295,7 @@ def _tell(outcome: Outcome, talk: Talk, *, as_json: bool, quiet: bool, verbose: 
         click.echo(json.dumps(run.summary))
     elif not quiet:
         for line in told(run.summary, run.verdicts, run.differences, all_of_them=verbose > 0):
-            click.echo(line)
+            click.echo(visible(line))  # names are as sent
     for line in outcome.incomplete:
         talk.say(line)
     for failure in outcome.failures:

@@ -67,6 +67,9 @@ def report(
     talk.say(f"{reading.frames} frames of {len(reading.streams)} streams -> {_paths_text(paths)}")
     for reason, nbytes in reading.skipped.items():
         talk.say(f"  {_skipped(reason, nbytes, reading, recording, recorder.undecoded)}")
+    if count := reading.tally.ignored_flows:
+        senders = f"{count} sender{'s' * (count > 1)}"
+        talk.say(f"  {reading.tally.ignored} bytes of {senders} without a single frame")
     for place, name in source.silent[:SHOWN_SILENT] if reading.frames else ():
         talk.say(f"  {name}: no data: {stage.reasons.why(place)}")
     if reading.own_drops:
@@ -77,7 +80,7 @@ def report(
         return Exit.INTERRUPTED
     if not reading.frames and not reading.skipped:
         raise nothing_came(source, stage.reasons)
-    return Exit.INCOMPLETE if reading.skipped or reading.own_drops else Exit.DONE
+    return Exit.INCOMPLETE if reading.skipped or reading.own_drops or reading.tally.ignored_flows else Exit.DONE
 
 
 def _skipped(reason: str, nbytes: int, reading: Reading, recording: Recording, kept: int) -> str:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pmutools.errors import SettingsError, SourceError
+from pmutools.formats.output import whole
 from pmutools.report.figures import Figure
 from pmutools.report.text import clean
 
@@ -118,10 +119,9 @@ def render(template: str, figures: Sequence[Figure], told: Mapping[str, Any], pa
 
 def write(path: Path, text: str) -> Path:
     """Write a page, whole or not at all. Raises SourceError."""
-    part = path.with_name(path.name + ".part")
     try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        with whole(path) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise SourceError(f"{path}: cannot write: {error.strerror or error}") from None
     return path

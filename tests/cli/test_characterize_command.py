@@ -43,6 +43,14 @@ def ids(found: dict[str, Any]) -> set[str]:
 # --- what comes of it
 
 
+def test_names_as_sent_never_steer_the_terminal(tmp_path: Path) -> None:
+    (capture,) = write(tmp_path / "x.pcap", recording(stream(name="A\x00\x07\x1b[31m"), 90))
+    result, told = characterized(capture, tmp_path / "run")
+    assert told["streams"][0]["name"] == "A\x00\x07\x1b[31m"
+    assert "A\\x00\\x07\\x1b[31m" in result.out
+    assert all(line.isprintable() for line in result.out.splitlines())
+
+
 def test_a_capture_by_its_stamps(tmp_path: Path) -> None:
     result, told = characterized(CJB, tmp_path / "run")
     assert result.code == 0, result.err

@@ -270,6 +270,19 @@ def test_bytes_that_are_no_frames_are_exit_code_3(tmp_path: Path) -> None:
     assert frames_in(out) == 10
 
 
+def test_a_strangers_noise_is_exit_code_3_too(tmp_path: Path) -> None:
+    port, out = free_udp_port(), tmp_path / "x.csv"
+    with started("read", f"udp://127.0.0.1:{port}", "--out", out, "--duration", 1.2, "--json") as reader:
+        wait_for_udp(port, reader)
+        send(port, [message.frame.data for message in recording(stream(), 10)], source_port=free_udp_port())
+        send(port, [b"no frame"] * 5, source_port=free_udp_port())
+        result = ended(reader)
+    assert result.code == 3
+    told = result.json
+    assert (told["frames"], told["skipped"], told["ignored_bytes"], told["ignored_flows"]) == (10, {}, 40, 1)
+    assert "40 bytes of 1 sender without a single frame" in result.err
+
+
 def test_data_without_a_configuration_are_told_and_are_exit_code_3(tmp_path: Path) -> None:
     port = free_udp_port()
     with started("read", f"udp://127.0.0.1:{port}", "--out", tmp_path / "x.csv", "--duration", 1.2) as reader:

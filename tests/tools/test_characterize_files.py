@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -179,6 +180,14 @@ def test_a_full_disk_gives_the_journal_s_room_to_the_summary(tmp_path: Path, mon
     running.recorder.put_summary("{}")
     assert (tmp_path / "summary.json").read_text() == "{}"
     assert not journal.exists() and running.recorder.samples is None
+    assert str(journal) not in {os.readlink(f"/proc/self/fd/{fd}").removesuffix(" (deleted)") for fd in open_files()}
+
+
+def open_files() -> list[str]:
+    """Those of this process; a file that is deleted but open still takes its room."""
+    if not Path("/proc/self/fd").is_dir():
+        pytest.skip("needs /proc")
+    return [fd for fd in os.listdir("/proc/self/fd") if os.path.islink(f"/proc/self/fd/{fd}")]
 
 
 def test_a_summary_never_costs_samples_that_are_whole(tmp_path: Path) -> None:

@@ -226,7 +226,7 @@ def test_garbage_costs_nothing_that_is_measured(tmp_path: Path) -> None:
     told = outcome.run.summary["run"]["input"]
     assert sum(told["skipped"].values()) == sum(map(len, own))
     assert told["ignored_flows"] == 1 and told["ignored_bytes"] > 0
-    assert outcome.incomplete
+    assert any("without a single frame" in line for line in outcome.incomplete)
 
 
 def test_a_sender_with_another_configuration(tmp_path: Path) -> None:

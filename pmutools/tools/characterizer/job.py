@@ -314,6 +314,8 @@ def _incomplete(told: Mapping[str, Any]) -> Iterator[str]:
     """What of the input was lost or undecodable."""
     for reason, nbytes in told["skipped"].items():
         yield f"{nbytes} bytes skipped: {reason}"
+    if told["ignored_flows"] and "defects" not in told:  # in a capture there may be all kinds of traffic
+        yield f"{told['ignored_bytes']} bytes of {told['ignored_flows']} senders without a single frame"
     if told["own_drops"]:
         yield f"{told['own_drops']} datagrams lost in this machine's receive buffer, not in the network"
     if told["unmeasured_frames"]:

@@ -131,9 +131,10 @@ class _Journal:
         self._file.flush()
 
     def close(self) -> None:
-        with suppress(SourceError):
-            self._stream.close()
-            self._file.close()
+        """Whatever does not fit: the file is closed, or a full disk would not get its room back."""
+        for part in (self._stream, self._file):
+            with suppress(SourceError):
+                part.close()
 
     def discard(self) -> None:
         self.close()

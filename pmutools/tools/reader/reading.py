@@ -85,6 +85,8 @@ class Reading:
             "skipped_by_flow": {flow: dict(reasons) for flow, reasons in self.skipped_by_flow.items()},
             "undecoded_frames": self.undecoded,
             "own_drops": self.own_drops,
+            "ignored_bytes": self.tally.ignored,
+            "ignored_flows": self.tally.ignored_flows,
         }
 
     def _count_block(self, block: Block) -> None:
