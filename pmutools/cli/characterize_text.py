@@ -10,6 +10,8 @@ from pmutools.measure.require import Verdict
 
 TOLD_STREAMS = 20
 """Of more streams the worst are told."""
+TOLD_MUTE = 3
+"""Of these, streams without data."""
 TOLD_DIFFERENCES = 40
 _NAMES = 4
 _HEAD = (
@@ -38,7 +40,9 @@ def told(
         rows = [(*rows[0], _CORRUPT), *((*row, str(of["corrupt"])) for row, of in zip(rows[1:], every, strict=True))]
     yield from _table(rows)
     if len(shown) < len(streams):
-        yield f"({len(streams) - len(shown)} more streams that fare better; -v shows all, summary.json holds all)"
+        mute = sum(not stream["received"] for stream in streams) - sum(not stream["received"] for stream in shown)
+        better = f"{len(streams) - len(shown) - mute} more streams that fare better"
+        yield f"({better}{f', {mute} that sent no data' if mute else ''}; -v shows all, summary.json holds all)"
     if summary["all"]["received"] and not summary["all"]["delay_ms"]["count"]:
         yield "no arrival times: of delays, windows and jitter nothing can be told"
     yield from _section("", _diagnoses(streams))
@@ -50,15 +54,20 @@ def told(
 
 
 def worst(streams: Sequence[Stream]) -> list[Stream]:
-    """Those that fare worst, by loss, then by what is said of them, then by delay; in their own order if few."""
+    """Those that fare worst, by loss, then by what is said of them, then by delay; in their own order if few.
+
+    A few at most that sent no data: somebody who announces thousands of streams must not hide those that there are.
+    """
     if len(streams) <= TOLD_STREAMS:
         return list(streams)
+    mute = [stream for stream in streams if not stream["received"]]
 
     def badness(stream: Stream) -> tuple[float, int, float]:
-        lost = 1.0 if not stream["received"] else _share(stream, "lost", "expected") or 0.0
+        lost = _share(stream, "lost", "expected") or 0.0
         return lost, sum(not _is_note(each) for each in stream["diagnoses"]), stream["delay_ms"]["p99"] or 0.0
 
-    return sorted(streams, key=badness, reverse=True)[:TOLD_STREAMS]
+    heard = sorted((stream for stream in streams if stream["received"]), key=badness, reverse=True)
+    return [*mute[: max(TOLD_MUTE, TOLD_STREAMS - len(heard))], *heard][:TOLD_STREAMS]
 
 
 def _row(stream: Stream) -> tuple[str, ...]:

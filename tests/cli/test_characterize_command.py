@@ -20,6 +20,7 @@ from support.recordings import write
 
 from pmutools.c37118 import Format, Frame, Message
 from pmutools.c37118.checksum import sealed
+from pmutools.cli.characterize_text import TOLD_MUTE, TOLD_STREAMS, worst
 from pmutools.flow import Flow, StampSource
 from pmutools.impair.profile import read_profile_file
 from pmutools.timebase import NS
@@ -41,6 +42,18 @@ def ids(found: dict[str, Any]) -> set[str]:
 
 
 # --- what comes of it
+
+
+def test_streams_that_are_only_announced_hide_none() -> None:
+    def of(name: str, received: int) -> dict[str, Any]:
+        return {"name": name, "received": received, "lost": 0, "expected": received, "diagnoses": [], "delay_ms": {}}
+
+    mute = [of(f"M{number}", 0) for number in range(2000)]
+    heard = [of(f"H{number}", 60) | {"delay_ms": {"p99": number}} for number in range(30)]
+    assert [each["name"] for each in worst([*mute, heard[0]])[-1:]] == ["H0"]
+    assert len(worst([*mute, *heard])) == TOLD_STREAMS
+    assert sum(not each["received"] for each in worst([*mute, *heard])) == TOLD_MUTE
+    assert worst([*mute, *heard])[TOLD_MUTE]["name"] == "H29"
 
 
 def test_names_as_sent_never_steer_the_terminal(tmp_path: Path) -> None:
