@@ -35,11 +35,14 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
 
 def arguments(settings: Settings, run_dir: str) -> list[str]:
     """Arguments of ``python -m dcon.watchdog`` for an initialisation file: everything in force."""
-    of, where = settings.watchdog, settings.output.url
+    from dcon.link.paths import OUTPUT
+
+    of, output = settings.watchdog, settings.output
+    datagrams = None if output.needs_process else output.url
     lines = ("estop_a", "estop_b", "contact_a", "contact_b", "relay_a", "relay_b")
     return [
         *("--run-dir", run_dir),
-        *("--output", "output.in" if where is None else str(where)),
+        *("--output", OUTPUT if datagrams is None else str(datagrams)),
         *("--status", ",".join(of.status)),
         *("--beats", ",".join(of.beats)),
         *(["--readback-required"] if of.readback == "required" else []),

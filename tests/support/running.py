@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from support.emulator import Gateway
+from support.iio import volts
 from support.live import free_ports
 from support.swing import MS, Streams
 
 from dcon.core.values import Pdci
 from dcon.drivers import line_status
+from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.keys import add_key, read_keys
 from dcon.server.client import Client, order
@@ -59,9 +61,9 @@ def recording(path: Path, names: tuple[str, ...] = NAMES) -> Path:
 class Around(threading.Thread):
     """What a site tells, ten times a second: the clock's lock, and the status of a line that obeys."""
 
-    def __init__(self, run_dir: Path, line_port: int, gateway: Gateway) -> None:
+    def __init__(self, run_dir: Path, line_port: int, driven_mw: Callable[[], float]) -> None:
         super().__init__(daemon=True)
-        self._gateway = gateway
+        self._driven_mw = driven_mw
         self.gps_age_s = 0.0
         self.in_service = True
         self._control, self._line = paths.Sender(run_dir / paths.CONTROL), ("127.0.0.1", line_port)
@@ -74,8 +76,7 @@ class Around(threading.Thread):
             number += 1
             news = {"kind": "gps", "age_s": self.gps_age_s, "source": "test", "detail": ""}
             self._control.send(json.dumps(news).encode())
-            driven_mw = self._gateway.commands[-1].command_mw if self._gateway.commands else 0.0
-            line = Pdci(time.time_ns(), 2000.0 + driven_mw, self.in_service, True, 2000.0)
+            line = Pdci(time.time_ns(), 2000.0 + self._driven_mw(), self.in_service, True, 2000.0)
             with suppress(OSError):
                 self._sock.sendto(line_status.encode(number, line), self._line)
 
@@ -88,11 +89,19 @@ class Around(threading.Thread):
 class Running:
     """One ``dcon run`` with all that is around it."""
 
-    def __init__(self, folder: Path, extra: str = "") -> None:
+    def __init__(
+        self, folder: Path, extra: str = "", names: tuple[str, ...] = NAMES, device: Path | None = None
+    ) -> None:
+        """``extra`` goes to the end of the initialisation file, ``names`` are PMUs of the fleet.
+
+        ``device`` is a fake of an IIO device that is driven, instead of the gateway.
+        """
         self.folder = folder
+        self.names = names
+        self.device = device
         self.run_dir = folder / "run"
         self.keys = folder / "keys.ini"
-        *self.ports, line_port, self.server_port = free_ports(len(NAMES) + 2)
+        *self.ports, line_port, self.server_port = free_ports(len(names) + 2)
         self.gateway = Gateway()
         self.server = Endpoint(Scheme.TCP, "127.0.0.1", self.server_port)
         add_key(self.keys, "ann")
@@ -101,7 +110,7 @@ class Running:
         self.ini = folder / "site.ini"
         settings = f"""
 [output]
-url = udp://127.0.0.1:{self.gateway.port}
+url = {f"iio://{device}?readback=0&settle_ms=0.2" if device else f"udp://127.0.0.1:{self.gateway.port}"}
 [platform]
 time_source = none
 gps_required = yes
@@ -122,14 +131,20 @@ keys = {self.keys}
 [log]
 path = {self.log}
 {extra}"""
-        self.ini.write_text(Streams(NAMES).ini(urls=urls, extra=settings))
-        self.around = Around(self.run_dir, line_port, self.gateway)
+        self.ini.write_text(Streams(names).ini(urls=urls, extra=settings))
+        self.around = Around(self.run_dir, line_port, self.driven_mw)
         self._processes: list[subprocess.Popen[bytes]] = []
         self.run: subprocess.Popen[bytes] | None = None
 
     @property
     def log(self) -> Path:
         return self.folder / "session.mcap"
+
+    def driven_mw(self) -> float:
+        """By the line now."""
+        if self.device is not None:
+            return volts(self.device) * MW_PER_V
+        return self.gateway.commands[-1].command_mw if self.gateway.commands else 0.0
 
     @property
     def watchdog_log(self) -> Path:
@@ -138,10 +153,10 @@ path = {self.log}
     # --- starting and ending
 
     def start(self, *arguments: str) -> None:
-        played = recording(self.folder / "swing.c37118")
+        played = recording(self.folder / "swing.c37118", self.names)
         to = [
             word
-            for name, port in zip(NAMES, self.ports, strict=True)
+            for name, port in zip(self.names, self.ports, strict=True)
             for word in ("--to", f"udp://127.0.0.1:{port}?idcode={Streams((name,)).configs[name].idcode}")
         ]
         delayed = ("--delay", "normal(60,1)")
@@ -155,8 +170,8 @@ path = {self.log}
         self.run = self._start("dcon.cli", "run", "--ini", str(self.ini), "--run-dir", str(self.run_dir), *arguments)
 
     def _start(self, module: str, *words: str) -> subprocess.Popen[bytes]:
-        with (self.folder / "stderr").open("ab") as said:
-            process = subprocess.Popen([sys.executable, "-m", module, *words], stdout=subprocess.DEVNULL, stderr=said)
+        with (self.folder / "stdout").open("ab") as out, (self.folder / "stderr").open("ab") as said:
+            process = subprocess.Popen([sys.executable, "-m", module, *words], stdout=out, stderr=said)
         self._processes.append(process)
         return process
 
@@ -183,6 +198,11 @@ path = {self.log}
     def said(self) -> str:
         """All that the processes wrote to stderr."""
         return (self.folder / "stderr").read_text(errors="replace")
+
+    def summary(self) -> dict[str, Any]:
+        """What ``dcon run --json`` wrote at its end."""
+        found: dict[str, Any] = json.loads((self.folder / "stdout").read_text().splitlines()[-1])
+        return found
 
     def status(self) -> dict[str, Any]:
         with Client(self.server) as client:

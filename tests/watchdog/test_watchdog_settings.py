@@ -66,6 +66,11 @@ log_mb = 2
     )
 
 
+@pytest.mark.parametrize("url", ["iio:///sys/bus/iio/devices/iio:device0", "modbus://127.0.0.1:502"])
+def test_what_the_output_process_drives_leaves_to_its_socket(url: str) -> None:
+    assert config_of(arguments(settings(f"[output]\nurl = {url}\n"), "run")).output == "output.in"
+
+
 def test_every_limit_is_a_key_with_its_bounds() -> None:
     keys = {item.name for item in fields(Watchdog)}
     assert set(Limits._fields) <= keys

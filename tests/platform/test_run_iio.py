@@ -1,0 +1,69 @@
+"""``dcon run`` that drives a DAC: from frames to counts in a fake of an IIO device, and its readback into the log."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.iio import counts, iio_device, volts
+from support.running import Running, command_line, descendants
+
+from dcon.session.log import SessionReader
+from dcon.session.replay import replay
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="dcon run and IIO are Linux's"),
+]
+ZERO = 32768
+
+
+def within(seconds: float, site: Running, low_v: float, high_v: float) -> bool:
+    """Whether the device's volts, either way, come to be in a range in time."""
+    assert site.device is not None
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        if low_v <= abs(volts(site.device)) <= high_v:
+            return True
+        time.sleep(0.001)
+    return False
+
+
+def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) -> None:
+    device = iio_device(tmp_path, out_voltage0_raw="1234")
+    site = Running(tmp_path, device=device)
+    try:
+        site.start("--json")
+        site.in_state("STANDBY")
+        assert counts(device) == ZERO, "what was there before is taken away at once"
+        site.activate()
+        assert within(5, site, 0.5, 10.0)
+        site.caught_up()
+        restarts = site.restarts()
+        assert site.run is not None
+        (output,) = [pid for pid in descendants(site.run.pid) if "dcon.cli output" in command_line(pid)]
+        os.kill(output, signal.SIGKILL)
+        site.until(lambda now: now["state"] != "ACTIVE", "the controller saw that the output was gone")
+        site.until(lambda _: site.restarts() == restarts + 1, "the output started again")
+        assert within(5, site, 0.0, 0.001)
+        site.activate()
+        assert within(5, site, 0.5, 10.0)
+        site.caught_up()
+        assert site.end() == 130
+    finally:
+        site.close()
+    assert counts(device) == ZERO
+    assert site.gateway.commands == []
+    assert site.summary()["restarts"] == {"output": 1}
+    told = [tick.surroundings.readback_v for tick in SessionReader(site.log).ticks()]
+    driven = [tick.record.output_v for tick in SessionReader(site.log).ticks()]
+    pairs = [(was, read) for was, read in zip(driven, told[1:], strict=False) if was and read is not None]
+    assert len(pairs) > 50
+    close = sum(abs(was - read) < 0.01 for was, read in pairs)
+    assert close > 0.9 * len(pairs)  # one that the relays hold at 0 V reads back so
+    assert replay(str(site.log)).different == 0
