@@ -12,14 +12,16 @@ from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
+from dcon.link.beats import Verb, encode_word
 from dcon.link.orders import LONGEST, Operator, SignedOrder, Verifier
 from dcon.link.paths import AIDE, WATCHDOG, Sender
-from dcon.server import words
 from dcon.server.newest import News
 from dcon.server.pending import Answer, Pending
 
 LOG = logging.getLogger(__name__)
 ASKS = ("status", "watch")
+VERBS = {"estop": Verb.ESTOP, "release": Verb.ESTOP_RELEASE, "reset": Verb.RESET}
+"""Orders that are the watchdog's too."""
 
 
 class Desk:
@@ -94,9 +96,9 @@ class Desk:
     def _tell_watchdog(self, signed: bytes, utc_ns: int) -> str:
         """Of what the watchdog was told, in words; "" for nothing. The controller judges the order for itself."""
         order = self._verifier.verify(signed, utc_ns)
-        if not isinstance(order, SignedOrder) or order.name not in words.WORDS:
+        if not isinstance(order, SignedOrder) or order.name not in VERBS:
             return ""
-        if not self._watchdog.send(words.word(order.name, order.who)):
+        if not self._watchdog.send(encode_word(VERBS[order.name], order.who)):
             return "; nor can the watchdog"
         LOG.warning("%s by %s: the watchdog was told", order.name, order.who)
         return "; the watchdog was told"

@@ -13,12 +13,12 @@ from typing import Any
 
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
+from dcon.link.beats import LoopName, LoopState, encode_beat
 from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
 from dcon.link.keys import read_keys
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
-from dcon.server import words
 from dcon.server.desk import Desk
 from dcon.server.newest import Newest, to_json
 from dcon.server.operators import Operators
@@ -111,7 +111,7 @@ class Server:
                     clock.sleep_until(now_ns + BREATH_NS)
                 if now_ns >= beat_ns:
                     beat_ns = now_ns + BEAT_NS
-                    self._beat(words.RUNNING)
+                    self._beat(LoopState.RUNNING)
                 if now_ns >= news_ns:
                     news_ns = now_ns + NEWS_NS
                     self._tell(now_ns)
@@ -159,7 +159,7 @@ class Server:
 
     def close(self) -> None:
         self._notifier.tell(STOPPING)
-        self._beat(words.ENDING)
+        self._beat(LoopState.ENDING)
         if not self._scribe.close():
             LOG.error("the disk does not take the log; %d bytes are not written", self._scribe.waiting)
         self._acknowledge()
@@ -291,9 +291,9 @@ class Server:
     def _hangs(self) -> bool:
         return self._scribe.hangs(SILENT_S)
 
-    def _beat(self, state: int) -> None:
+    def _beat(self, state: LoopState) -> None:
         self._beats += 1
-        self._watchdog.send(words.beat(self._beats, self.clock.monotonic_ns(), state))
+        self._watchdog.send(encode_beat(LoopName.SERVER, self._beats, self.clock.monotonic_ns(), state))
 
     def _tell(self, now_ns: int) -> None:
         """News for the controller, none where the log hangs; and a status for who watches."""
