@@ -30,8 +30,8 @@ class SystemClock:
     """The machine's clocks.
 
     ``spin_ns`` is how long before a deadline sleeping gives way to a busy wait: it takes the wake-up error from some
-    50 µs to below 1 µs at the price of a core for that time. Keep it short (200 µs), and 0 under SCHED_FIFO, where
-    spinning runs into the kernel's 95 % limit. ``native=False`` takes the portable sleep.
+    50 µs to below 1 µs at the price of a core for that time. Keep it short (200 µs): under SCHED_FIFO nobody else has
+    that core meanwhile, and the kernel's limit of 95 % ends a long one. ``native=False`` takes the portable sleep.
     """
 
     def __init__(self, *, spin_ns: int = 0, native: bool = linux.NATIVE) -> None:

@@ -25,8 +25,8 @@ class Shortfall(NamedTuple):
 def go_realtime(*, fifo: bool, priority: int = FIFO_PRIORITY) -> Shortfall:
     """Leave no garbage to go over, little timer slack, memory locked; with ``fifo`` SCHED_FIFO at ``priority`` (1..99).
 
-    Concerns this process, and this thread of it, until it ends. Call it once everything is loaded, and never spin
-    under SCHED_FIFO. Never raises.
+    Concerns this process, and this thread of it, until it ends. Call it once everything is loaded, and spin
+    for microseconds only under SCHED_FIFO. Never raises.
     """
     gc.collect()
     gc.freeze()

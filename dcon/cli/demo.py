@@ -49,7 +49,7 @@ def command(
     else:
         click.echo(_table(summary, gain))
         picture = f", picture {summary['picture']}" if summary["picture"] else ""
-        click.echo(f"session log {demo.log_path}, summary {out / 'summary.json'}{picture}")
+        click.echo(f"session log {summary['session']}, summary {out / 'summary.json'}{picture}")
     if summary["picture"] is None:
         talk.say("no picture: matplotlib is not installed; pip install 'pmutools[analysis]' brings it")
     opened, closed = summary["open_loop"], summary["closed_loop"]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.command(name="platform", short_help="The real-time controller: PMU streams in, command out, session log.")
 @click.option("--ini", required=True, metavar="FILE")
 @click.option("--run-dir", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Be one of several.")
-@click.option("--log", metavar="FILE", help="Session log; default: [log] path. Not with --run-dir.")
+@click.option("--log", metavar="FILE", help="Session log, or NAME-2 ...; default: [log] path. Not with --run-dir.")
 @click.option("--duration", type=Parsed(number(1e-3, 1e9)), metavar="S", help="Stop S seconds after --start.")
 @click.option("--start", metavar="UTC", help="What --duration and --order count from; default: now.")
 @click.option("--order", "orders", multiple=True, metavar="S:NAME[=VALUE]", help="An order for later; repeatable.")
@@ -45,9 +45,9 @@ def command(
 ) -> int:
     """Run the controller: PMU streams in, 60 ticks a second, the command out, everything logged.
 
-    Alone it receives, drives [output] and writes the session log itself. With --run-dir (or [platform] run_dir) it is
-    one of several processes that meet in that folder: the command goes to the watchdog, the log to the server. `dcon
-    run` starts them all.
+    Alone it receives, drives [output] and writes the session log itself, without a watchdog. With --run-dir (or
+    [platform] run_dir) it is one of several processes that meet in that folder: the command goes to the watchdog, the
+    log to the server. `dcon run` starts them all.
 
     Ctrl-C ramps the command down, which takes a second, and ends; a second Ctrl-C ends at once.
 

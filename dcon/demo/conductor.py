@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from dcon.demo.course import Course
 from dcon.demo.judge import read_traces, summarise
 from dcon.link.keys import add_key, read_keys
 from dcon.server.client import Client, order
+from dcon.session.parts import free_path
 from dcon.sim.plan import ini_of
 from pmutools import timebase
 from pmutools.errors import PmuError, SourceError
@@ -59,10 +60,12 @@ class Demo:
     profile: str = "table1"
     noise_rad: float = 1e-4
     seed: int = 1
+    log: str = "session.mcap"
+    """In ``out``; where there is one already, :func:`perform` takes the next name."""
 
     @property
     def log_path(self) -> Path:
-        return self.out / "session.mcap"
+        return self.out / self.log
 
 
 def free_ports(count: int) -> int:
@@ -108,8 +111,9 @@ class Site:
 def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, seconds: None) -> dict[str, Any]:
     """Run the demo and leave ``session.mcap``, ``summary.json``, ``demo.png`` and ``dcon.ini`` in ``demo.out``.
 
-    ``tell`` is given what is going on and the seconds from the start. Returns what :func:`report` does. Raises
-    DemoError where a process fails, SourceError where the folder cannot be written.
+    The session log of a demo before is kept: the next is ``session-2.mcap``. ``tell`` is given what is going on and the
+    seconds from the start. Returns what :func:`report` does. Raises DemoError where a process fails, SourceError where
+    the folder cannot be written.
     """
     pmus = fleet()
     base = free_ports(len(pmus) + 2)
@@ -117,7 +121,7 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
         demo.out.mkdir(parents=True, exist_ok=True)
         with _alone(demo.out), tempfile.TemporaryDirectory(prefix="dcon-demo-") as work:
             site = Site(demo.out / "dcon.ini", Path(work), base, base + 1, base + 2, free_tcp_port())
-            _clear(demo.log_path)
+            demo = replace(demo, log=free_path(demo.log_path).name)
             add_key(site.keys, WHO)
             site.ini.write_text(
                 ini_of(
@@ -134,12 +138,6 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
         raise
     except OSError as error:
         raise SourceError(f"--out {demo.out}: {error.strerror}") from None
-
-
-def _clear(path: Path) -> None:
-    """Take away the log of a demo before: a server writes beside a log, never over it."""
-    for part in (path, *path.parent.glob(f"{path.stem}.part*{path.suffix}")):
-        part.unlink(missing_ok=True)
 
 
 def _extra(demo: Demo, site: Site) -> str:
@@ -241,6 +239,7 @@ def report(demo: Demo, start_ns: int) -> dict[str, Any]:
     """
     traces = read_traces(str(demo.log_path), start_ns)
     summary = summarise(traces, demo.course, demo.gain_mw_per_mhz)
+    summary["session"] = str(demo.log_path)
     try:
         from dcon.demo.picture import draw
     except ImportError:

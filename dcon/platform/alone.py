@@ -9,6 +9,7 @@ from dcon.link.crossing import Item
 from dcon.platform.ports import Ends, Nowhere
 from dcon.platform.receiving import Reception
 from dcon.session.head import Head
+from dcon.session.parts import free_path
 from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.clock import Clock
@@ -24,14 +25,17 @@ class OwnFrames:
     def __init__(self, reception: Reception, clock: Clock) -> None:
         self._reception, self._clock = reception, clock
         self.counts = reception.counts
+        self._items: list[Item] = []
 
-    def until(self, deadline_ns: int) -> Sequence[Item]:
-        items: list[Item] = []
+    def wait(self, deadline_ns: int) -> None:
         clock, reception = self._clock, self._reception
         while (left_ns := deadline_ns - clock.monotonic_ns()) > 2 * COARSE_NS:
-            reception.parse(reception.receive(left_ns - COARSE_NS), items.append)
+            reception.parse(reception.receive(left_ns - COARSE_NS), self._items.append)
         clock.sleep_until(deadline_ns)
-        reception.parse(reception.receive(0), items.append)
+
+    def take(self) -> Sequence[Item]:
+        self._reception.parse(self._reception.receive(0), self._items.append)
+        items, self._items = self._items, []
         return items
 
     def close(self) -> None:
@@ -39,7 +43,10 @@ class OwnFrames:
 
 
 def own_ends(settings: Settings, clock: Clock, log_path: str) -> Ends:
-    """All in this process. Raises SourceError where a port cannot be bound or a host is unknown."""
+    """All in this process. A log that is there already stays: the session's is NAME-2, NAME-3, ... beside it.
+
+    Raises SourceError where a port cannot be bound or a host is unknown.
+    """
     command = Nowhere() if settings.output.url is None else UdpCommandDriver(settings.output.url)
     try:
         receivers = Receivers([site.endpoint for site in settings.sites], clock)
@@ -49,6 +56,6 @@ def own_ends(settings: Settings, clock: Clock, log_path: str) -> Ends:
     limits = settings.log
 
     def open_log(head: Head) -> RollingWriter:
-        return RollingWriter(log_path, head, max_mb=limits.max_mb, max_minutes=limits.max_minutes)
+        return RollingWriter(free_path(log_path), head, max_mb=limits.max_mb, max_minutes=limits.max_minutes)
 
     return Ends(OwnFrames(Reception(receivers), clock), open_log, command)

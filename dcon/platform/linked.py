@@ -39,7 +39,7 @@ LOG = logging.getLogger(__name__)
 PAIR_BYTES = 4 << 20
 """Asked for in the pair: seconds of eight PMUs."""
 MESSAGES_A_TICK = 64
-"""Of the front; what is left waits in the pair."""
+"""Of the front, before a deadline and after it; what is left waits in the pair."""
 LARGEST_BYTES = 1 << 18
 NEWS_A_TICK = 64
 LAST_S = 5.0
@@ -61,8 +61,10 @@ class PairFrames:
         self.counts = Counts()
         self._early: list[Item] = []
 
-    def until(self, deadline_ns: int) -> Sequence[Item]:
+    def wait(self, deadline_ns: int) -> None:
         self._clock.sleep_until(deadline_ns)
+
+    def take(self) -> Sequence[Item]:
         items, self._early = self._early, []
         items += self._drained()
         return items

@@ -38,6 +38,8 @@ from pmutools.realtime import go_realtime
 
 LOG = logging.getLogger(__name__)
 SPIN_NS = 200_000
+EARLY_NS = 2_000_000
+"""So long before a tick, what is there already is taken: the tick itself has only to take what came since."""
 CLOCK_CHECK_TICKS = 60
 CATCH_UP_S = 1
 """Ticks missed for longer are left out: whatever they would have held up has gone wrong by then."""
@@ -166,8 +168,13 @@ class Platform:
             if ending and engine.state.system not in ENGAGED:
                 return
             deadline_ns = offset.monotonic_ns(tick_ns)
-            self._take(frames.until(deadline_ns))
+            if (early_ns := deadline_ns - EARLY_NS) > clock.monotonic_ns():
+                frames.wait(early_ns)
+                self._take(frames.take())
+                news.listen(clock.monotonic_ns())
+            frames.wait(deadline_ns)
             started_ns = clock.monotonic_ns()
+            self._take(frames.take())
             told = news.told(started_ns)
             summary.trouble = summary.trouble or told.trouble
             orders = self._orders(book.due(tick_ns), told, ending)

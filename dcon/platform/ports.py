@@ -2,7 +2,7 @@
 
 The control loop knows these four only. In one process they are sockets and a file (:mod:`dcon.platform.alone`); with a
 run folder they are the sockets of other processes (:mod:`dcon.platform.linked`). None of them may wait, but
-:meth:`Frames.until` for its deadline.
+:meth:`Frames.wait` for its deadline.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ class Frames(Protocol):
     counts: Counts
     """What did not become frames."""
 
-    def until(self, deadline_ns: int) -> Sequence[Item]:
-        """Return at ``deadline_ns`` (monotonic) with what has come by then, in order; at once where that is past."""
+    def wait(self, deadline_ns: int) -> None:
+        """Return at ``deadline_ns`` (monotonic); at once where that is past."""
+
+    def take(self) -> Sequence[Item]:
+        """What has come by now, in order."""
 
     def close(self) -> None: ...
 
@@ -41,6 +44,9 @@ class Told(NamedTuple):
 
 class News(Protocol):
     """What a tick is told."""
+
+    def listen(self, now_ns: int) -> None:
+        """Take in what is there already, for the tick to come."""
 
     def told(self, now_ns: int) -> Told:
         """News up to now (monotonic); each order once."""
@@ -90,6 +96,9 @@ class Log(Protocol):
 
 class Quiet:
     """Nothing is told."""
+
+    def listen(self, now_ns: int) -> None:
+        pass
 
     def told(self, now_ns: int) -> Told:
         return Told()

@@ -12,6 +12,7 @@ from dcon.link.bundle import Bundle, Entry, Kind
 from dcon.server import state as states
 from dcon.server.state import State
 from dcon.session.head import head_of
+from dcon.session.parts import free_path
 from dcon.session.rolling import RollingWriter
 from pmutools.errors import SourceError
 from pmutools.schema.log_writer import seal
@@ -153,7 +154,7 @@ class Recorder:
 
     def _free(self) -> Path:
         try:
-            return states.free_path(self.path)
+            return free_path(self.path)
         except SourceError as error:  # it may be there later: the writer tries again and again
             LOG.error("%s", error)
             return Path(self.path).with_stem(f"{Path(self.path).stem}-{self._key[:8]}")

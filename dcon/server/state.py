@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from pathlib import Path
 from typing import NamedTuple
-
-from pmutools.errors import SourceError
 
 FILE = "server.state"
 
@@ -58,22 +55,3 @@ def save(folder: Path, state: State) -> bool:
     except OSError:
         return False
     return True
-
-
-def free_path(path: str | os.PathLike[str]) -> Path:
-    """``path``, or ``NAME-2``, ``NAME-3``, ...: the first that no session has, nor a part of one.
-
-    Raises SourceError where the folder cannot be looked into.
-    """
-    first = Path(path)
-    try:
-        there = {entry.name for entry in os.scandir(first.parent)}
-    except OSError as error:
-        raise SourceError(f"{first.parent}: {error.strerror}") from None
-    part = re.compile(rf"(.+)\.part\d+{re.escape(first.suffix)}")
-    there |= {f"{match[1]}{first.suffix}" for name in there if (match := part.fullmatch(name))}
-    number, free = 1, first
-    while free.name in there:
-        number += 1
-        free = first.with_name(f"{first.stem}-{number}{first.suffix}")
-    return free

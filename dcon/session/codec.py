@@ -30,7 +30,8 @@ _INSTANCE_STATES = {str(state): state for state in InstanceState}
 
 
 class Timing(NamedTuple):
-    """How a tick ran: microseconds from its start to its command, and from its nominal time to its start."""
+    """How a tick ran: microseconds from its start to its command, and from its nominal time to its start, which is when
+    the loop woke up."""
 
     compute_us: float
     late_us: float

@@ -8,6 +8,7 @@ their metadata; names alone do not, for an earlier session may have left its own
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -41,6 +42,27 @@ def part_path(first: str | os.PathLike[str], number: int) -> Path:
     """Where part ``number`` of the session that begins in ``first`` is."""
     path = Path(first)
     return path if number == 1 else path.with_name(f"{path.stem}.part{number}{path.suffix}")
+
+
+def free_path(path: str | os.PathLike[str]) -> Path:
+    """``path``, or ``NAME-2``, ``NAME-3``, ...: the first that no session has, nor a part of one.
+
+    Raises SourceError where the folder cannot be looked into.
+    """
+    first = Path(path)
+    if first.exists() and not first.is_file():
+        return first  # a device, or a folder: whoever writes there is told
+    try:
+        there = {entry.name for entry in os.scandir(first.parent)}
+    except OSError as error:
+        raise SourceError(f"{first.parent}: {error.strerror}") from None
+    part = re.compile(rf"(.+)\.part\d+{re.escape(first.suffix)}")
+    there |= {f"{match[1]}{first.suffix}" for name in there if (match := part.fullmatch(name))}
+    number, free = 1, first
+    while free.name in there:
+        number += 1
+        free = first.with_name(f"{first.stem}-{number}{first.suffix}")
+    return free
 
 
 def part_of(path: str | os.PathLike[str]) -> Part:

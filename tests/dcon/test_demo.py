@@ -36,7 +36,7 @@ from pmutools.timebase import NS
 SHORT = Course(open_loop_s=3.2, swing_s=6.5, init_s=0.8)
 KEYS = {
     *("gain_mw_per_mhz", "open_loop", "closed_loop", "peak_command_mw", "final_state", "ticks", "frames"),
-    *("delay_ms", "wake_up_late_us", "compute_us", "picture"),
+    *("delay_ms", "wake_up_late_us", "compute_us", "session", "picture"),
 }
 
 
@@ -351,6 +351,7 @@ def test_the_whole_chain_live_on_a_short_course(tmp_path: Path, monkeypatch: pyt
     """Sockets, processes and clocks as in ``dcon demo``; only the data are verified for less than 20 s."""
     monkeypatch.setattr(conductor, "LEAD_S", 1.5)
     told: list[str] = []
+    (tmp_path / "session.mcap").write_bytes(b"that of a demo before")
     summary = perform(Demo(tmp_path, 12.0, SHORT), lambda text, seconds: told.append(text))
     assert len(told) == 7
     opened, closed = summary["open_loop"], summary["closed_loop"]
@@ -362,5 +363,9 @@ def test_the_whole_chain_live_on_a_short_course(tmp_path: Path, monkeypatch: pyt
     assert 60 < summary["peak_command_mw"] <= 125
     assert summary["final_state"] == "STANDBY"
     assert summary["delay_ms"]["mean"] == pytest.approx(60, abs=3)
-    assert {path.name for path in tmp_path.iterdir()} == {"session.mcap", "summary.json", "demo.png", "dcon.ini"}
-    assert run(dcon(), ["replay", str(tmp_path / "session.mcap"), "--quiet"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("session.mcap", "session-2.mcap", "summary.json", "demo.png", "dcon.ini")
+    }
+    assert (tmp_path / "session.mcap").read_bytes() == b"that of a demo before"
+    assert summary["session"] == str(tmp_path / "session-2.mcap")
+    assert run(dcon(), ["replay", summary["session"], "--quiet"]) == 0

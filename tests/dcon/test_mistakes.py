@@ -51,3 +51,7 @@ def test_a_controller_that_heard_nothing_says_so(tmp_path: Path, capsys: pytest.
     words = ["platform", "--ini", str(ini), "--log", str(tmp_path / "s.mcap"), "--duration", "0.5"]
     assert run(dcon(), words) == 1
     assert "no frame came from any PMU" in capsys.readouterr().err
+    before = (tmp_path / "s.mcap").read_bytes()
+    assert run(dcon(), words) == 1
+    assert "s-2.mcap" in capsys.readouterr().err
+    assert (tmp_path / "s.mcap").read_bytes() == before  # a session that is there already stays

@@ -75,7 +75,7 @@ class Rig:
 
     def turn(self) -> list[Item]:
         self.front.turn()
-        return list(self.frames.until(0))
+        return list(self.frames.take())
 
     def turns(self, until: int) -> list[PmuFrameIn]:
         """Frames, once there are as many; a failure after some seconds."""
@@ -163,7 +163,7 @@ def test_a_control_process_that_stands_still_is_not_waited_for_and_loses_no_conf
     assert rig.front.outlet.is_open
     found: list[Item] = []
     for _ in range(20):
-        found += rig.frames.until(0)
+        found += rig.frames.take()
         rig.front.turn()
     changed = [item for item in found if isinstance(item, PmuFrameIn) and item.is_config]
     assert [item.pmu for item in changed] == [1]
@@ -211,7 +211,7 @@ def test_a_port_in_use_is_told_in_one_line(tmp_path: Path) -> None:
         port = int(taken.getsockname()[1])
         process, frames = start(tmp_path, [port, free_udp_port()])
         assert process.wait(20) == 1
-    (failure,) = frames.until(0)
+    (failure,) = frames.take()
     frames.close()
     assert isinstance(failure, Failure) and f"udp://127.0.0.1:{port}" in failure.reason and "\n" not in failure.reason
 
@@ -243,10 +243,11 @@ def test_a_killed_front_is_seen_at_once(tmp_path: Path) -> None:
     end_s = time.monotonic() + 20
     while len(bound) < 2:
         assert time.monotonic() < end_s
-        bound += frames.until(CLOCK.monotonic_ns() + ROUND_NS)
+        frames.wait(CLOCK.monotonic_ns() + ROUND_NS)
+        bound += frames.take()
     process.kill()
     process.wait(5)
-    assert frames.until(0) == []
+    assert frames.take() == []
     frames.close()
 
 
