@@ -26,6 +26,7 @@ bench: $(VENV)/.dev
 soak: $(VENV)/.dev
 	PYTHONPATH=tests $(BIN)/python -m bench.pacing 600
 	PYTHONPATH=tests $(BIN)/python -m bench.characterizing 600
+	PYTHONPATH=tests $(BIN)/python -m bench.running 1800
 	DCON_KILLS=50 $(BIN)/python -m pytest tests/platform/test_kills.py
 
 $(BIN)/python:

@@ -12,7 +12,9 @@ from pathlib import Path
 
 from bench.table import Budget, Row
 
-from dcon.session.log import LoggedTick, SessionReader, SessionWriter
+from dcon.session.head import Head
+from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 
@@ -53,15 +55,8 @@ def write(path: Path, sizes: Sizes) -> int:
     reader = SessionReader(short)
     ticks = list(reader.ticks())
     whole_ns = round(sizes.simulated_s) * 10**9
-    with SessionWriter(
-        path,
-        ini_text=reader.ini_text,
-        configs=reader.configs,
-        metadata=reader.metadata,
-        pmus=reader.pmus,
-        instances=reader.instances,
-        flags=reader.flags,
-    ) as log:
+    head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags, reader.metadata)
+    with RollingWriter(path, head, reader.configs) as log:
         for number in range(sizes.times):
             for tick in ticks:
                 later = shifted(tick, number * whole_ns)

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from bench.host import rss_kib, steal_s
 from bench.layouts import RATE, A
 from bench.table import Budget, Row
 
@@ -74,9 +75,9 @@ def rows(sizes: Sizes) -> Iterator[Row]:
         source = write(Path(folder) / "source.pcap", sizes)
         seen, ours, theirs = Path(folder) / "seen.pcap", list[Errors](), list[Errors]()
         for _ in range(2 * sizes.rounds):
-            steal_s = _steal()
+            before_s = steal_s()
             ours.append(errors(source, _watched(seen, _player(source)), sizes))
-            if _steal() - steal_s > STEAL_S and len(ours) < sizes.rounds:
+            if steal_s() - before_s > STEAL_S and len(ours) < sizes.rounds:
                 ours.pop()  # the host took the processor away: that is no player's error
                 continue
             theirs.append(errors(source, _watched(seen, _tcpreplay(source)), sizes))
@@ -188,13 +189,13 @@ def soak(seconds: int, pmus: int = 2000) -> int:
     capture = Path(__file__).resolve().parents[2] / "captures" / "cjb-8pmu.pcap"
     command = [*_PLAY, str(capture)]
     options = ["--to", f"udp://127.0.0.1:{PORT}", "--emulate", str(pmus), "--loop", "0", "--duration", str(seconds)]
-    steal, began = _steal(), time.monotonic()
+    steal, began = steal_s(), time.monotonic()
     memory: list[int] = []
     with sink(), subprocess.Popen([*command, *options, "--quiet", "--json"], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         while process.poll() is None and time.monotonic() - began < seconds + 60:
             time.sleep(min(10.0, max(1.0, seconds / 20)))
-            memory.append(_rss_kib(process.pid))
+            memory.append(rss_kib(process.pid))
             print(f"{time.monotonic() - began:6.0f} s  {memory[-1] / 1024:7.1f} MiB", flush=True)
             if memory[-1] == 0 or time.monotonic() - began > seconds:
                 break
@@ -204,24 +205,11 @@ def soak(seconds: int, pmus: int = 2000) -> int:
     p50, p99 = (statistics.median(stream[name] for stream in late) for name in ("p50", "p99"))
     steady = [kib for kib in memory[len(memory) // 4 :] if kib]
     growth = (steady[-1] - steady[0]) / 1024 if len(steady) > 1 else 0.0
-    most, stolen_s = max(stream["max"] for stream in late), _steal() - steal
+    most, stolen_s = max(stream["max"] for stream in late), steal_s() - steal
     print(f"{sent} frames of {pmus} PMUs in {seconds} s; late p50 {p50:.0f} us, p99 {p99:.0f} us, max {most:.0f} us")
     print(f"memory grew by {growth:.1f} MiB; the host took {stolen_s:.2f} s of processor time")
     due = pmus * RATE * (seconds - 1.2)
     return int(not (sent >= due and growth < 4 and p50 <= 20 and p99 <= 1000))
-
-
-def _rss_kib(pid: int) -> int:
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("VmRSS")), 0)
-
-
-def _steal() -> float:
-    """Seconds that the host has taken from this machine's processors."""
-    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from bench import (
     receiving,
     startup,
     table,
+    waking,
 )
 from bench.layouts import BLOCK, LAYOUTS
 from bench.table import Row
@@ -33,6 +34,7 @@ def measured(*, quick: bool) -> Iterator[Row]:
     yield from capture.rows(capture.QUICK if quick else capture.FULL)
     yield from startup.rows(startup.QUICK if quick else startup.FULL)
     yield from control.rows(control.QUICK if quick else control.FULL)
+    yield from waking.rows(waking.QUICK if quick else waking.FULL)
     yield from analyzing.rows(analyzing.QUICK if quick else analyzing.FULL)
     yield from measuring.rows(measuring.QUICK if quick else measuring.FULL)
     yield from receiving.rows(receiving.QUICK if quick else receiving.FULL)
@@ -46,7 +48,7 @@ def method() -> list[str]:
     layouts = "; ".join(f"**{layout.name}** {layout.text}" for layout in LAYOUTS)
     return [
         f"Measured on {table.today()} on a {table.machine()}, with {table.versions(PEERS)} (synchrophasor is pypmu) "
-        f"and {_tshark()}.",
+        f"and {_tshark()}. cyclictest is that of Debian's rt-tests.",
         "",
         "One run on one machine: in every round each contender works once, in turn with the others; figures are "
         "medians over the rounds, `±` is half the distance between the quartiles, and a result is the median of the "

@@ -22,6 +22,7 @@ from bench import (
     receiving,
     startup,
     table,
+    waking,
 )
 from bench.layouts import BLOCK, LAYOUTS, A, B, C, Layout
 from bench.stopwatch import Rate
@@ -79,6 +80,16 @@ def test_the_player_is_watched_beside_tcpreplay(requires: Callable[[str], Path])
     rows = list(pacing.rows(pacing.QUICK))
     assert len(rows) == 4
     assert all(row.budget is not None and row.group == "player" for row in rows)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's")
+def test_the_control_loop_is_judged_beside_cyclictest() -> None:
+    rows = list(waking.rows(waking.QUICK))
+    assert [row.group for row in rows] == ["control"] * 3
+    assert [row.budget is not None for row in rows] == [bool(shutil.which("cyclictest"))] * 2 + [True]
+    assert all(row.result > 0 and "steal" in row.ours for row in rows)
 
 
 @pytest.mark.realtime
