@@ -19,6 +19,7 @@ from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
 from dcon.session.column_tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
 from dcon.session.columns import read_columns
+from dcon.session.newer import Newer
 from dcon.session.parts import part_of
 from dcon.settings import parse
 from pmutools.errors import SettingsError, SourceError
@@ -129,6 +130,11 @@ class Outcome:
         return compare([found for session in self.sessions for found in session.ringdowns])
 
     @property
+    def newer(self) -> list[tuple[list[str], Newer]]:
+        """(files, what they hold that this program does not know) of each session with such."""
+        return [(session.files, found) for session in self.sessions if (found := session.columns.newer)]
+
+    @property
     def lost(self) -> bool:
         """Whether something of the input could not be read."""
         return bool(self.unread) or any(session.damaged for session in self.sessions)
@@ -140,6 +146,7 @@ class Outcome:
             "between": [gap._asdict() for gap in self.between],
             "comparison": [row.to_json() for row in self.comparison],
             "unread": [{"file": name, "why": why} for name, why in self.unread],
+            "newer": [{"files": files, **(found.to_json() or {})} for files, found in self.newer],
         }
 
 

@@ -75,7 +75,7 @@ def told(outcome: Outcome, ordered: Sequence[tuple[Analysis, list[Figure]]]) -> 
     """All names that the template knows."""
     return {
         "outcome": outcome,
-        "main": main_findings(outcome),
+        "main": [*main_findings(outcome), *(f"{files[0]} {newer}." for files, newer in outcome.newer)],
         "unread": outcome.unread,
         "between": tables.gap_table(outcome.between, "between", "Between the sessions"),
         "comparison": tables.comparison_table(outcome.comparison, "open-closed"),

@@ -32,14 +32,12 @@ def command(sessions: tuple[str, ...], out: Path, as_json: bool, quiet: bool, ve
     spare_in(out, (PAGE, JSON, FIGURES), sessions)
     outcome = write_analysis(sessions, out, lambda name: talk.progress(f"reading {name}"))
     talk.progress("")
-    newer = [(session.files, found) for session in outcome.sessions if (found := session.columns.newer)]
     if as_json:
-        said = [{"files": files, **(found.to_json() or {})} for files, found in newer]
-        click.echo(json.dumps(outcome.to_json() | {"newer": said}, allow_nan=False))
+        click.echo(json.dumps(outcome.to_json(), allow_nan=False))
     else:
         for sentence in main_findings(outcome):
             click.echo(sentence)
-    for files, found in newer:
+    for files, found in outcome.newer:
         talk.say(f"warning: {files[0]} {found}")
     for _, why in outcome.unread:
         talk.say(f"not read: {why}")

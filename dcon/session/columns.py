@@ -42,8 +42,8 @@ from dcon.session.column_tables import (
 from dcon.session.log import SessionReader
 from dcon.session.newer import newer_in
 from dcon.session.parts import Part, Paths, is_apart
-from pmutools.schema.columns import Columns, Texts, decode_columns
-from pmutools.schema.descriptors import message_class
+from pmutools.schema.columns import Texts, decode_columns
+from pmutools.schema.descriptors import message_class, unnamed_fields
 from pmutools.schema.log_reader import LogReader
 from pmutools.schema.pmu_log import name_of
 
@@ -233,19 +233,26 @@ class _Builder:
             stamp_source=_codes(of["stamp_source"], STAMP_SOURCES),
         )
 
-    def _columns(self, kind: str, messages: list[bytes], fields: Collection[str]) -> Columns:
+    def _columns(self, kind: str, messages: list[bytes], fields: Collection[str]) -> tuple[Ints, dict[str, Any]]:
+        """``rows`` and ``fields`` of the messages; what else there is to say of them is noted."""
         columns = decode_columns(kind, messages, fields)
-        self._reader.parts[0].log.damage.undecodable += len(messages) - len(columns.rows)
-        return columns
+        log = self._reader.parts[0].log
+        log.damage.undecodable += len(messages) - len(columns.rows)
+        log.unnamed(kind, columns.unnamed)
+        return columns.rows, columns.fields
 
     def _each(self, kind: str, messages: list[bytes]) -> Iterator[Any]:
         from google.protobuf.message import DecodeError
 
+        log = self._reader.parts[0].log
         for message in messages:
             try:
-                yield message_class(kind).FromString(message)
+                decoded = message_class(kind).FromString(message)
             except DecodeError:
-                self._reader.parts[0].log.damage.undecodable += 1
+                log.damage.undecodable += 1
+                continue
+            log.unnamed(kind, unnamed_fields(decoded))
+            yield decoded
 
     def session(self) -> SessionColumns:
         reader = self._reader

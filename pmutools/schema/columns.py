@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pmutools.schema.descriptors import message_class
+from pmutools.schema.descriptors import message_class, unnamed_fields
 from pmutools.schema.messages import MESSAGES, Field
 
 Array = npt.NDArray[Any]
@@ -41,16 +41,18 @@ class Columns(NamedTuple):
 
     ``rows`` (M,): which of the messages given they are, those that do not decode left out. ``fields`` by name: (M,) of
     float64, uint64, bool or int64, or :class:`Texts`; of a list (M, L), L the longest, filled up with NaN, 0 or -1.
+    ``unnamed`` are the numbers of fields that the table lacks.
     """
 
     rows: Ints
     fields: dict[str, Any]
+    unnamed: frozenset[int] = frozenset()
 
 
 def decode_columns(name: str, messages: Sequence[bytes], fields: Collection[str]) -> Columns:
     """The named ``fields`` (none of bytes) of ``messages``, which are of the kind ``name`` of the table.
 
-    Fields that the table lacks are passed over; strings that are not wanted are not looked at.
+    Of fields that the table lacks only the numbers are told; strings that are not wanted are not looked at.
     """
     return _Decoder(name, messages, fields).columns()
 
@@ -74,6 +76,7 @@ class _Decoder:
         self._wanted = {field.name: field for field in self._known.values() if field.name in fields}
         count = len(messages)
         self._good = np.zeros(count, np.bool_)
+        self._unnamed: set[int] = set()
         self._arrays = {key: _empty(field, count, int(not field.repeated)) for key, field in self._wanted.items()}
         self._codes: dict[str, dict[bytes, int]] = {key: {} for key in self._wanted}
         self._octets = np.frombuffer(b"".join(messages) + bytes(_LONGEST_VARINT), np.uint8)
@@ -98,7 +101,7 @@ class _Decoder:
                 fields[key] = Texts(array, [text.decode() for text in self._codes[key]])
             else:
                 fields[key] = array
-        return Columns(rows, fields)
+        return Columns(rows, fields, frozenset(self._unnamed))
 
     def _step(self, group: _Group) -> _Group | None:
         """Read the next field of every message; returns those that go on, and puts aside who has another."""
@@ -128,6 +131,8 @@ class _Decoder:
         if not tag >> 3 or (field is not None and kind != _kind(field)):
             self._one_by_one(group.rows)
             return None
+        if field is None:
+            self._unnamed.add(tag >> 3)
         wanted = field if field is not None and field.name in self._wanted else None
         if kind == _VARINT:
             return self._varint(group, wanted)
@@ -230,6 +235,7 @@ class _Decoder:
             except DecodeError:
                 continue
             self._good[row] = True
+            self._unnamed |= unnamed_fields(message)
             for key, field in self._wanted.items():
                 given = getattr(message, key)
                 values = list(given) if field.repeated else [given]

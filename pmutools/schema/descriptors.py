@@ -62,6 +62,14 @@ def unknown_fields(schema: bytes) -> frozenset[str]:
     )
 
 
+def unnamed_fields(message: Any) -> frozenset[int]:
+    """Numbers of the fields of a decoded message that our table lacks."""
+    from google.protobuf.unknown_fields import UnknownFieldSet
+
+    unknown = UnknownFieldSet(message)
+    return frozenset(unknown[place].field_number for place in range(len(unknown)))
+
+
 @cache
 def _classes() -> dict[str, Any]:
     from google.protobuf import descriptor_pool, message_factory

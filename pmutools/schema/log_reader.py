@@ -14,7 +14,7 @@ from typing import IO, Any, NamedTuple
 
 from pmutools.errors import SourceError
 from pmutools.schema import mcap_records as raw
-from pmutools.schema.descriptors import message_class, short_name, unknown_fields
+from pmutools.schema.descriptors import message_class, short_name, unknown_fields, unnamed_fields
 from pmutools.schema.mcap_records import MESSAGE_RECORD, DamagedRecordError, Op
 
 
@@ -140,7 +140,6 @@ class LogReader:
     def decode(self, message: LogMessage) -> Any | None:
         """The protobuf message; None for one that is not ours, or (counted) does not decode."""
         from google.protobuf.message import DecodeError
-        from google.protobuf.unknown_fields import UnknownFieldSet
 
         name = message.channel.message
         if name is None:
@@ -150,13 +149,12 @@ class LogReader:
         except DecodeError:
             self.damage.undecodable += 1
             return None
-        if len(unknown := UnknownFieldSet(decoded)):
-            self._unnamed(name, {unknown[place].field_number for place in range(len(unknown))})
+        self.unnamed(name, unnamed_fields(decoded))
         return decoded
 
-    def _unnamed(self, name: str, numbers: Collection[int]) -> None:
-        """Fields that no schema told of: only their numbers are known."""
-        if not any(known.startswith(f"{name}.") for known in self.unknown):
+    def unnamed(self, name: str, numbers: Collection[int]) -> None:
+        """Take note of fields of ``name`` that no schema told of: only their numbers are known."""
+        if numbers and not any(known.startswith(f"{name}.") for known in self.unknown):
             self.unknown.update(f"{name}.{number}" for number in numbers)
 
     def _open(self) -> IO[bytes]:

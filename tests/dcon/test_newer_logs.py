@@ -121,11 +121,14 @@ def test_what_is_not_known_is_said_and_the_rest_is_read(
     assert code == 0 and err.count("warning: ") == 1 and warning in err.splitlines()
     found = json.loads(out)
     assert found["newer"] == ([{"files": [str(path)], **keys}] if command == "analyze" else keys)
+    if command == "analyze":
+        assert json.loads(Path("report/analysis.json").read_text())["newer"] == found["newer"]
+        assert said in Path("report/report.html").read_text()
     if command == "replay":
         assert (found["ticks"], found["different"], found["stopped"]) == (120, 0, None)
 
 
-@pytest.mark.parametrize("command", ["replay", "export"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_a_field_that_no_schema_names(
     command: str, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmutools.schema.columns import FEW, Texts, decode_columns
-from pmutools.schema.descriptors import message_class
+from pmutools.schema.descriptors import message_class, unnamed_fields
 from pmutools.schema.messages import MESSAGES, Field
 
 NAMES = ("READY", "HELD", "INITIALISING", "", "Δf → 9", "x" * 200)
@@ -67,6 +67,7 @@ def compare(name: str, messages: list[bytes], fields: list[str] | None = None) -
         except DecodeError:
             continue
     assert columns.rows.tolist() == [row for row, _ in expected]
+    assert columns.unnamed >= {field for _, decoded in expected for field in unnamed_fields(decoded)}
     for key in wanted:
         column = columns.fields[key]
         for place, (_, decoded) in enumerate(expected):
