@@ -15,28 +15,6 @@ PERIODIC_SHARE = 0.35
 """A period that makes this much of the variance of delays is no chance."""
 
 
-def _period(scene: Scene) -> str | None:
-    middle, period = scene.middle_ns, scene.result.period_ns
-    if middle is None or not period or middle <= 0:
-        return None
-    why = "the source stamps and then waits (or fills its window) before it sends; the network is not to blame"
-    periods = middle / period
-    floor = scene.result.counts.delays.delay.min_ns or 0
-    steady = middle - floor < 0.2 * period
-    if abs(periods - 1) <= 0.05 and steady:
-        return f"the delay, {ms_text(middle)}, is one reporting period of {ms_text(period)}: {why}"
-    seen = {}
-    for other in scene.others:
-        if other.middle_ns > 0:
-            seen[other.rate] = other.middle_ns * other.rate / NS
-    if len(seen) < 2 or not 0.4 <= periods <= 10 or max(seen) < 1.5 * min(seen):
-        return None
-    if max(seen.values()) > 1.1 * min(seen.values()):
-        return None
-    told = ", ".join(f"{count:.2f} periods at {rate:g}/s" for rate, count in sorted(seen.items()))
-    return f"the delay grows with 1/Fs ({told}): {why}"
-
-
 def _own_drops(scene: Scene) -> str | None:
     counts = scene.result.counts
     if not counts.events.own_drops:
@@ -181,7 +159,6 @@ def _late(scene: Scene) -> str | None:
 
 
 ROWS: tuple[Row, ...] = (
-    Row("delay-of-a-period", "delay of one period, or proportional to 1/Fs over the streams", _period),
     Row("own-drops", "the receiver's socket buffer overflowed", _own_drops),
     Row("host-stalls", "the measuring process stood still", _stalls),
     Row("reconnects", "a connection that was lost, a sender that began anew", _reconnects),

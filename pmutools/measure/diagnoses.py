@@ -5,10 +5,17 @@ A row looks at one stream's result beside the receiver's clock and the other str
 
 from __future__ import annotations
 
-from pmutools.measure import arrival_signs, clock_signs, device_signs
+from pmutools.measure import arrival_signs, clock_signs, device_signs, period_signs
 from pmutools.measure.scene import Diagnosis, Row, Scene
 
-ROWS: tuple[Row, ...] = (*clock_signs.ROWS, *device_signs.ROWS, *arrival_signs.ROWS, *device_signs.NOTES)
+ROWS: tuple[Row, ...] = (
+    *clock_signs.ROWS,
+    *device_signs.ROWS,
+    *period_signs.ROWS,
+    *arrival_signs.ROWS,
+    *period_signs.NOTES,
+    *device_signs.NOTES,
+)
 
 
 def diagnose(scene: Scene) -> list[Diagnosis]:

@@ -16,6 +16,7 @@ REMEDIES = {
     "clock-skew": "discipline both clocks; PDV and inter-arrival times hold meanwhile",
     "latency-step": "look what was changed at that time: routes, filters (P or M class), clocks",
     "delay-of-a-period": "ask the vendor for the reporting latency; a higher rate, or P class filters, shorten it",
+    "about-a-period": "measure the same device at another rate: a delay that the window makes goes with it",
     "reconnects": "look into the log for when, and at the sender for why",
     "tcp-losses": "look for the lossy link on the path; over UDP a loss delays no other frame",
     "pauses": "look into the sender's and the network's logs at that time",

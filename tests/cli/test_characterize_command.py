@@ -273,7 +273,7 @@ CASES: dict[str, Callable[[], list[Message]]] = {
     "trigger-stuck": lambda: with_stat(0x0800),
     "clock-skew": lambda: recording(stream(), 9000, latency_ns=lambda k: jittery(k) + k * 2000),
     "latency-step": lambda: recording(stream(), 9000, latency_ns=lambda k: jittery(k) + 9 * MS * (k > 5000)),
-    "delay-of-a-period": lambda: recording(stream(), 300, latency_ns=lambda k: 20 * MS + k % 5 * 10_000),
+    "about-a-period": lambda: recording(stream(), 300, latency_ns=lambda k: 20 * MS + k % 5 * 10_000),
     "stale-frames": stale,
     "rate-mismatch": lambda: recording(stream(), 300, latency_ns=jittery, slots=range(0, 600, 2)),
     "off-grid": off_grid,

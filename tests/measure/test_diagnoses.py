@@ -151,6 +151,13 @@ HEALTHY: dict[str, Scene] = {
     "a PMU alone at two rates": Scene(stream(), clock(), peers(stream(), stream(rate=30))),
 }  # fmt: skip
 
+
+def at_rates(own: int, delays_ms: dict[int, float]) -> Scene:
+    """One stream a rate, of so much delay, and the scene of that at ``own``."""
+    results = {rate: stream(1200, ms - 1, rate=rate) for rate, ms in delays_ms.items()}
+    return Scene(results[own], clock(), peers(*results.values()))
+
+
 sawtooth = np.where(np.arange(COUNT) % 2 == 0, 16.0, 0.0)
 at_30 = stream(rate=30, delay_ms=1.5 * 1000 / 30)
 SICK: dict[str, tuple[Scene, str]] = {
@@ -179,13 +186,18 @@ SICK: dict[str, tuple[Scene, str]] = {
         Scene(measured(arranged(batch(stamps(range(COUNT)), 44 + noise() + 8.0 * (np.arange(COUNT) > 7000)))), clock()),
         "+8",
     ),
-    "delay-of-a-period": (
+    "about-a-period": (
         Scene(measured(batch(stamps(range(COUNT)), 1000 / 60 + noise(mean_ms=0.1))), clock()),
-        "one reporting period",
+        "may be a device that waits for its window before it sends, or chance",
+    ),
+    "about-a-period network": (Scene(stream(delay_ms=15.6), clock(), peers(stream(delay_ms=15.6))), "another rate"),
+    "delay-of-a-period": (
+        at_rates(60, {10: 102, 30: 1000 / 30 + 2, 60: 1000 / 60 + 2, 120: 1000 / 120 + 2}),
+        "1.00 periods and 1.7",
     ),
     "delay-of-a-period everywhere": (
         Scene(stream(delay_ms=1.5 * 1000 / 60), clock(), peers(stream(delay_ms=1.5 * 1000 / 60), at_30)),
-        "grows with 1/Fs",
+        "a third would tell",
     ),
     "stale-frames": (
         Scene(
@@ -310,6 +322,13 @@ def test_every_row_has_a_case() -> None:
         ("clock-skew", Scene(stream(delay_ms=44 + np.arange(COUNT) / 60 * 0.0005), clock())),
         ("latency-step", SICK["clock-skew"][0]),
         ("delay-of-a-period", Scene(stream(delay_ms=44.0), clock(), peers(stream(), stream(rate=30)))),
+        ("delay-of-a-period", at_rates(50, dict.fromkeys((10, 50, 60, 100), 20.0))),
+        ("about-a-period", at_rates(50, dict.fromkeys((10, 50, 60, 100), 20.0))),
+        ("delay-of-a-period", at_rates(60, {10: 100, 30: 33.3, 60: 40, 120: 8.3})),
+        ("delay-of-a-period", at_rates(60, {30: 61, 60: 44})),  # two that differ, as two networks do
+        ("delay-of-a-period", at_rates(60, {10: 77, 30: 30.3, 60: 18.7})),  # of no window
+        ("delay-of-a-period", Scene(stream(delay_ms=15.6), clock(), peers(stream(delay_ms=15.6)))),
+        ("about-a-period", Scene(stream(delay_ms=17 + 9 * np.sin(np.arange(COUNT))), clock())),
         ("rate-mismatch", Scene(slots(np.flatnonzero(RNG.random(COUNT) > 0.4)), clock())),
         ("two-senders", SICK["rate-mismatch faster"][0]),
         ("multicast-ageing", Scene(silent_after(60), clock())),
