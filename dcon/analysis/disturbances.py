@@ -32,7 +32,12 @@ QUIET_S: Final = 60.0
 QUIET_KNOWN_S: Final = 3.0
 """... as far as so much of it is known."""
 REST_S: Final = 6.0
-"""After one disturbance, none is looked for during this time."""
+"""So long after a disturbance, its own swing may change Δf: only a change that itself is :data:`SUDDEN` times the most
+of the :data:`BEFORE_S` before begins another ..."""
+SAME_S: Final = 2.0
+"""... and one before that is the same, and moves its begin: swings of several modes may hide each other at first ..."""
+RISE_S: Final = 1.0
+"""... unless it is so early that it is the first rise."""
 
 
 class Found(NamedTuple):
@@ -45,17 +50,21 @@ class Found(NamedTuple):
 def disturbances(delta_f_mhz: Floats, rate_hz: float) -> Found:
     """Of a session's Δf (T,), NaN where unknown."""
     change = _changes(delta_f_mhz, rate_hz)
-    rest, quiet, least = (round(s * rate_hz) for s in (REST_S, QUIET_S, QUIET_KNOWN_S))
+    rest, same, rise = (round(s * rate_hz) for s in (REST_S, SAME_S, RISE_S))
+    quiet, least = (round(s * rate_hz) for s in (QUIET_S, QUIET_KNOWN_S))
     lag = round(LAG_S * rate_hz)
     session = noise = _quiet_blocks(change, round(BLOCK_S * rate_hz))
     rows: list[int] = []
-    for row in np.flatnonzero((change > LEAST_MHZ) & _sudden(change, rate_hz)).tolist():
-        if rows and row < rows[-1] + rest:
+    usual = _usual(change, rate_hz)
+    for row in np.flatnonzero((change > LEAST_MHZ) & _sudden(change, usual, rate_hz)).tolist():
+        if rows and row < rows[-1] + (rise if change[row] > SUDDEN * usual[row] else rest):
             continue
         past = change[max(0, row - lag - quiet) : max(0, row - lag)]
         past = past[np.isfinite(past)]
         before = min(session, _deviation(past)) if past.size >= least else session
         if change[row] > FACTOR * before:
+            if rows and row < rows[-1] + same:
+                rows.pop()
             rows.append(row)
             noise = min(noise, before)
     return Found(rows, noise)
@@ -72,21 +81,27 @@ def _deviation(change: Floats) -> float:
     return 1.4826 * float(np.median(change))
 
 
-def _sudden(change: Floats, rate_hz: float) -> npt.NDArray[np.bool_]:
-    """(T,) whether the largest change of the next :data:`LAG_S` is far above that of :data:`BEFORE_S` before."""
+def _usual(change: Floats, rate_hz: float) -> Floats:
+    """(T,) the largest change of :data:`BEFORE_S` up to :data:`LAG_S` ago; inf where too little of it is known."""
     before, lag, least = (round(s * rate_hz) for s in (BEFORE_S, LAG_S, KNOWN_S))
-    window = np.lib.stride_tricks.sliding_window_view
-    known = np.where(np.isfinite(change), change, -np.inf)
-    past = np.concatenate((np.full(before + lag, -np.inf), known))[: len(change) + before]
-    ahead = np.concatenate((known, np.full(lag, -np.inf)))
-    if not len(change):
-        return np.zeros(0, np.bool_)
+    past = np.concatenate((np.full(before + lag, -np.inf), _known(change)))[: len(change) + before]
     counts = np.cumsum(np.concatenate(([0], np.isfinite(past))))
     enough = (counts[before:] - counts[:-before])[: len(change)] >= least
-    return np.asarray(
-        enough
-        & (window(ahead, lag).max(axis=1)[: len(change)] > SUDDEN * window(past, before).max(axis=1)[: len(change)])
-    )
+    return np.where(enough, _windows(past, before).max(axis=1)[: len(change)], np.inf) if len(change) else change
+
+
+def _sudden(change: Floats, usual: Floats, rate_hz: float) -> npt.NDArray[np.bool_]:
+    """(T,) whether the largest change of the next :data:`LAG_S` is far above what was ``usual``."""
+    lag = round(LAG_S * rate_hz)
+    ahead = np.concatenate((_known(change), np.full(lag, -np.inf)))
+    return np.asarray(_windows(ahead, lag).max(axis=1)[: len(change)] > SUDDEN * usual)
+
+
+def _known(change: Floats) -> Floats:
+    return np.where(np.isfinite(change), change, -np.inf)
+
+
+_windows: Final = np.lib.stride_tricks.sliding_window_view
 
 
 def _changes(delta_f_mhz: Floats, rate_hz: float) -> Floats:

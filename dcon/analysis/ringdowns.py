@@ -112,8 +112,11 @@ def _starts(loop: Loop) -> list[int]:
     """Rows at which something begins to move the grid: disturbances, and probing signals, however small."""
     probing = np.diff((loop.probe_mw != 0).astype(np.int8), prepend=0) > 0
     found: list[int] = []
-    for row in sorted((*disturbances(loop.delta_f_mhz, loop.rate_hz).rows, *np.flatnonzero(probing).tolist())):
-        if not found or row >= found[-1] + round(REST_S * loop.rate_hz):
+    disturbed = set(disturbances(loop.delta_f_mhz, loop.rate_hz).rows)
+    forced = round(FORCED_S * loop.rate_hz)
+    for row in sorted(disturbed.union(np.flatnonzero(probing).tolist())):
+        another = row in disturbed and not loop.probe_mw[max(0, row - forced) : row + 1].any()  # no answer to the probe
+        if not found or another or row >= found[-1] + round(REST_S * loop.rate_hz):
             found.append(row)
     return found
 

@@ -123,6 +123,40 @@ def test_a_second_disturbance_ends_the_first_swing() -> None:
     assert first.length_s == pytest.approx(12 - SETTLE_S, abs=0.5)
 
 
+@pytest.mark.parametrize("noise_mhz", [0.0, 0.02])
+@pytest.mark.parametrize("later_s", [2.5, 3.0, 4.0, 5.0, 5.9])
+def test_a_large_disturbance_soon_after_a_small_one_is_found(later_s: float, noise_mhz: float) -> None:
+    """The fit of neither runs across the second."""
+    delta = Swing(10, 0.43, 0.078, 2.5, noise_mhz).signal() + Swing(10 + later_s, 0.43, 0.078, 30.0).signal()
+    given_ = loop(delta)
+    first, second = ringdowns(given_)
+    assert seconds(given_, first.disturbed_ns) == pytest.approx(10, abs=0.5)
+    assert seconds(given_, second.disturbed_ns) == pytest.approx(10 + later_s, abs=0.3)
+    assert first.mode is None and "s are needed" in first.why
+    assert second.mode is not None
+    assert second.mode.damping_percent.median == pytest.approx(7.8, abs=0.2)
+
+
+def test_one_that_grows_at_once_is_fitted_from_its_growth() -> None:
+    given_ = loop(Swing(10, 0.43, 0.078, 2.5).signal() + Swing(11.5, 0.43, 0.078, 30.0).signal())
+    (found,) = ringdowns(given_)
+    assert seconds(given_, found.disturbed_ns) == pytest.approx(11.5, abs=0.3)
+    assert found.mode is not None
+
+
+@pytest.mark.parametrize("frequency_hz", [0.2, 0.43, 0.8])
+@pytest.mark.parametrize("other_hz", [0.15, 0.6, 1.1])
+def test_a_swing_of_two_modes_is_one_disturbance(frequency_hz: float, other_hz: float) -> None:
+    delta = Swing(10, frequency_hz, 0.03).signal() + Swing(10, other_hz, 0.05, -15.0).signal()
+    assert len(ringdowns(loop(delta))) == 1
+
+
+def test_the_answer_to_a_probing_signal_is_no_disturbance_beside_it() -> None:
+    delta = Swing(10.4).signal()
+    probe = np.where((np.arange(len(delta)) >= 10 * RATE) & (np.arange(len(delta)) < 15 * RATE), 20.0, 0.0)
+    assert len(ringdowns(loop(delta, probe_mw=probe))) == 1
+
+
 def test_the_fit_begins_after_saturation_and_only_of_what_is_driven() -> None:
     delta = Swing(10).signal()
     command = np.where(np.arange(len(delta)) < 15 * 60, np.clip(12 * delta, -125, 125), 0.0)
