@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -35,6 +35,7 @@ from pmutools.report.text import utc
 MOST_POINTS: Final = 12_000
 """Of one line: beyond, pairs of least and largest values, so that no peak is lost."""
 MOST_FLAGS: Final = 16
+MOST_INSTANCES: Final = 16
 MOST_RINGDOWNS: Final = 8
 """With a figure of their own."""
 MOST_STRETCHES: Final = 3000
@@ -115,18 +116,10 @@ def comparison_figure(rows: Sequence[Comparison]) -> Figure:
 
 
 def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Figure:
-    names = ["state", "mode", "active instance"]
-    marks: list[Mark] = []
-    marks += _gap_marks(session)
-    for name, found in _by_name(session.states).items():
-        marks += bars(name, found, 0, STATE_COLORS.get(name, theme.MUTED), shown_ms, listed=True)
-    for name, found in _by_name(session.modes).items():
-        marks += bars(name, found, 1, theme.GREEN if name == "closed_loop" else theme.MUTED, shown_ms)
-    by_instance = {name: found for name, found in _by_name(session.actives).items() if name}
-    for place, (name, found) in enumerate(by_instance.items()):
-        marks += bars(name, found, 2, theme.CYCLE[place % len(theme.CYCLE)], shown_ms)
-    for name, found in sorted(session.flags.items(), key=lambda item: item[1][0].begin_ns)[:MOST_FLAGS]:
-        marks += bars(name, found, len(names), theme.VERMILION, shown_ms)
+    names: list[str] = []
+    marks: list[Mark] = _gap_marks(session)
+    for name, found, color in _rows(session):
+        marks += bars(name, found, len(names), color, shown_ms)
         names.append(name)
     if orders := session.columns.orders[:MOST_STRETCHES]:
         marks.append(
@@ -140,6 +133,7 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
             )
         )
         names.append("orders")
+    many = len({each.name for each in session.actives if each.name}) > MOST_INSTANCES
     told = ", then ".join(dict.fromkeys(each.name for each in session.states))
     return Figure(
         f"{stem}-timeline",
@@ -149,6 +143,7 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
         [Panel(Axis("", names=names), marks)],
         "Point at a bar for its name and times. Flags are drawn in the order in which they first rose"
         + (f", the first {MOST_FLAGS}." if len(session.flags) > MOST_FLAGS else ".")
+        + (f" Of the instances, the first {MOST_INSTANCES} that were active." if many else "")
         + f" Stretches too short to be seen are pale bars of {(shown_ms[1] - shown_ms[0]) / SHADES / 1e3:.2g} s each, "
         "the darker the more of it they fill; zoom in to see them one by one."
         + (" Shaded: ticks that are not in the log." if session.gaps else ""),
@@ -157,9 +152,20 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
     )
 
 
-def bars(
-    name: str, found: Sequence[Stretch], row: int, color: str, shown_ms: tuple[float, float], *, listed: bool = False
-) -> list[Line]:
+def _rows(session: Analysis) -> Iterator[tuple[str, list[Stretch], str]]:
+    """A row for each state, mode, active instance and flag: its name, when, and a colour that says no more."""
+    for name, found in _by_name(session.states).items():
+        yield f"state {name}", found, STATE_COLORS.get(name, theme.MUTED)
+    for name, found in _by_name(session.modes).items():
+        yield f"mode {name}", found, theme.MUTED
+    active = {name: found for name, found in _by_name(session.actives).items() if name}
+    for name, found in list(active.items())[:MOST_INSTANCES]:
+        yield f"active {name}", found, theme.INK
+    for name, found in sorted(session.flags.items(), key=lambda item: item[1][0].begin_ns)[:MOST_FLAGS]:
+        yield name, found, theme.VERMILION
+
+
+def bars(name: str, found: Sequence[Stretch], row: int, color: str, shown_ms: tuple[float, float]) -> list[Line]:
     """Stretches as thick broken lines: below, what is too short to be seen, as shades; above, every stretch itself."""
     begin_ms, cell_ms = shown_ms[0], (shown_ms[1] - shown_ms[0]) / SHADES
     short = [each for each in found if (each.end_ns - each.begin_ns) / 1e6 < cell_ms]
@@ -173,13 +179,13 @@ def bars(
         from_ns, to_ns = (round((begin_ms + number * cell_ms) * 1e6) for number in (cell, cell + 1))
         words = f"{name}: {len(times_ms)} times, {sum(times_ms) / 1e3:.3f} s in all"
         shades.setdefault(tint, []).append(Stretch(words, from_ns, to_ns))
-    drawn = [_bar(name, each, row, theme.tint(color, tint), listed=False) for tint, each in sorted(shades.items())]
+    drawn = [_bar(name, each, row, theme.tint(color, tint)) for tint, each in sorted(shades.items())]
     lost = set(short) if len(found) > MOST_STRETCHES else set()
     exact = [each for each in found if each not in lost]
-    return [*drawn, _bar(name, exact[:MOST_STRETCHES], row, color, listed=listed)] if exact else drawn
+    return [*drawn, _bar(name, exact[:MOST_STRETCHES], row, color)] if exact else drawn
 
 
-def _bar(name: str, found: Sequence[Stretch], row: int, color: str, *, listed: bool) -> Line:
+def _bar(name: str, found: Sequence[Stretch], row: int, color: str) -> Line:
     """Stretches as one thick broken line."""
     x = [value for each in found for value in (each.begin_ns / 1e6, each.end_ns / 1e6, math.nan)]
     words = [
@@ -187,7 +193,7 @@ def _bar(name: str, found: Sequence[Stretch], row: int, color: str, *, listed: b
         for each in found
         for text in (*(f"{each.name}: {utc(each.begin_ns, 3)}, {(each.end_ns - each.begin_ns) / 1e9:.3f} s",) * 2, "")
     ]
-    return Line(name, np.array(x), np.full(len(x), float(row)), color, width=11, hover=words, listed=listed)
+    return Line(name, np.array(x), np.full(len(x), float(row)), color, width=11, hover=words, listed=False)
 
 
 def _by_name(found: Iterable[Stretch]) -> dict[str, list[Stretch]]:

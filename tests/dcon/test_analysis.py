@@ -28,6 +28,10 @@ from pmutools.report import theme
 Capsys = pytest.CaptureFixture[str]
 
 
+ROWS = {"state": "states", "mode": "modes", "active": "active_instances"}
+"""Of the timeline, by their word, and where they are in the JSON."""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("sessions")
@@ -51,6 +55,16 @@ def report(closed: Path, folder: Path) -> tuple[Path, dict[str, Any]]:
     out = folder / "report"
     assert run(dcon(), ["analyze", str(closed), str(folder / "open.mcap"), "--out", str(out), "--quiet"]) == 0
     return out, json.loads((out / "analysis.json").read_text())
+
+
+def test_rows_of_the_timeline_are_named_not_coloured_alone(report: tuple[Path, dict[str, Any]]) -> None:
+    """In the picture and on the page."""
+    out, told = report
+    closed, _ = told["sessions"]
+    names = [f"{kind} {each['name']}" for kind, key in ROWS.items() for each in closed[key] if each["name"]]
+    assert {"state ACTIVE", "mode closed_loop"} < set(names) and any(name.startswith("active N") for name in names)
+    drawn, page = (out / "figures" / "01-timeline.svg").read_text(), (out / "report.html").read_text()
+    assert all(f">{name}</text>" in drawn and f'"{name}"' in page for name in names)
 
 
 @pytest.mark.parametrize(
