@@ -27,7 +27,8 @@ _NAMES = {"delay": "stamp-to-arrival delay (ms)", "pdv": "delay above its floor,
 def bin_edges(found: Histogram, most_bins: int = BINS) -> Floats:
     """Edges (B + 1,) in ns that show where most values lie: all, unless a few lie far out. No finer than is known."""
     low, high = float(found.min_ns or 0), float(found.max_ns or 0)
-    inner_low, inner_high = (value or 0.0 for value in found.quantiles_ns((0.001, 0.999)))
+    few = min(0.05, max(0.001, 2 / max(found.count, 1)))  # of some hundred, the last thousandth is the largest itself
+    inner_low, inner_high = (value or 0.0 for value in found.quantiles_ns((few, 1 - few)))
     if high - low > 3 * (inner_high - inner_low) + 10 * error_ns(high):
         spare = 0.1 * (inner_high - inner_low)
         low, high = max(low, inner_low - spare), min(high, inner_high + spare)
@@ -96,7 +97,7 @@ def distribution_figure(stream: Stream) -> Figure:
             Panel(Axis("frames (%)", range=(0, 1.08 * float(share.max()))), _histogram(x, share, fitted)),
             Panel(Axis("not later (%)", range=(0, 103)), _distribution(stream, x, fitted)),
         ],
-        f"Bins of {x[1] - x[0]:.3g} ms. {_outside(found, found.count - float(below[-1] - below[0]))}",
+        f"Bins of {x[1] - x[0]:.3g} ms. {_outside(found, float(below[-1] - below[0]), ' (see the tail)')}",
         430,
     )
 
@@ -136,13 +137,14 @@ def _distribution(stream: Stream, x: Floats, fitted: Model | None) -> list[Mark]
     return [*marks, _marked(found)]
 
 
-def _outside(found: Histogram, outside: float) -> str:
+def _outside(found: Histogram, inside: float, more: str = "") -> str:
+    outside = found.count - inside
     if outside < 0.5:
         return ""
     low, high = ((end or 0) / NS_PER_MS for end in (found.min_ns, found.max_ns))
     return (
-        f"{count(outside)} frames ({percent(outside / found.count)}) lie outside of what is shown; all lie from "
-        f"{milliseconds(low)} to {milliseconds(high)} ms (see the tail)."
+        f"Outside of what is shown: {count(outside)} of {count(found.count)} ({percent(outside / found.count)}); "
+        f"all lie from {milliseconds(low)} to {milliseconds(high)} ms{more}."
     )
 
 
@@ -211,6 +213,7 @@ def interarrival_figure(stream: Stream) -> Figure:
     found, period_ms = stream.result.counts.delays.interarrival, stream.result.period_ns / NS_PER_MS
     edges = bin_edges(found, 2 * BINS)
     number = np.diff(_below(found, edges))
+    inside = float(number.sum())
     x, step = edges / NS_PER_MS, float(edges[1] - edges[0]) / NS_PER_MS
     kept = number > 0
     middle = ((x[:-1] + x[1:]) / 2)[kept]
@@ -228,8 +231,8 @@ def interarrival_figure(stream: Stream) -> Figure:
     caption = (
         f"Sd {milliseconds(told['sd'])} ms, p1 {milliseconds(told['p1'])}, p99 {milliseconds(told['p99'])}, largest "
         f"{milliseconds(told['max'])} ms. Bins of {step:.3g} ms. Only the receiver's clock matters here; a lost frame "
-        "makes it 2/Fs."
-    )
+        f"makes it 2/Fs. {_outside(found, inside)}"
+    ).rstrip()
     return Figure(
         f"{stream.stem}-interarrival",
         f"{stream.label}: time between arrivals",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -219,6 +220,17 @@ def test_bins_hold_what_they_show_and_tails_fall(values: list[int]) -> None:
     assert inside >= 0.9 * len(values) - 2
     x, above = tail_points(found)
     assert (np.diff(x) >= 0).all() and (np.diff(above) <= 0).all() and above[-1] < 1e-9
+
+
+@pytest.mark.parametrize("seconds", [4.0, 10.0, 60.0])
+def test_one_pause_does_not_widen_the_bins_of_inter_arrival_times(seconds: float) -> None:
+    """It is told as outside of what is shown."""
+    run = run_of([Made("N1", seconds + 3, outage_s=(seconds / 2, seconds / 2 + 3))])
+    _, drawn = compose(run)
+    (found,) = (each for each in drawn if each.name.endswith("-interarrival"))
+    bars = next(mark for mark in found.panels[0].marks if isinstance(mark, Bars))
+    assert bars.width < 1.0 and found.x.range is not None and found.x.range[1] < 100
+    assert re.search(r"Outside of what is shown: [1-5] of .*; all lie from .* to 3,0\d\d", found.caption)
 
 
 def test_tails_of_many_bins_are_thinned() -> None:

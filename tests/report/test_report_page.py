@@ -300,25 +300,21 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         write_report(run_of([Made("N1", 1)]), tmp_path / "file")
 
 
-@pytest.mark.peer
-@pytest.mark.slow
-def test_a_browser_draws_all_of_it_offline(tmp_path: Path) -> None:
-    """Where a browser is: every figure is drawn, with all names of the network unknown and the page's own policy on."""
+def shown(path: Path, *options: str) -> str:
+    """The page as a browser has drawn it, with all names of the network unknown."""
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         pytest.skip("no Chromium is installed")
-    text, figures = compose(run_of([Made("<b>N1", 10), Made("N2", 10, loss=0.1)], require=LIMITS))
-    path = tmp_path / "report.html"
-    path.write_text(text, encoding="utf-8")
     done = subprocess.run(
         [
             browser,
             "--headless",
             "--no-sandbox",
             "--disable-gpu",
-            f"--user-data-dir={tmp_path / 'profile'}",
+            f"--user-data-dir={path.parent / 'profile'}",
             "--host-resolver-rules=MAP * ~NOTFOUND",
             "--virtual-time-budget=20000",
+            *options,
             "--dump-dom",
             path.as_uri(),
         ],
@@ -326,7 +322,33 @@ def test_a_browser_draws_all_of_it_offline(tmp_path: Path) -> None:
         text=True,
         timeout=100,
     )
-    plots = [each for each in done.stdout.split('class="')[1:] if each.startswith("plot js-plotly-plot")]
-    assert len(plots) == len(figures), done.stderr[-2000:]
-    assert done.stdout.count('class="main-svg"') >= len(figures)
-    assert "modebar-btn" in done.stdout and "sendDataToCloud" not in done.stdout.partition("<script>")[0]
+    assert done.stdout, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.peer
+@pytest.mark.slow
+def test_a_browser_draws_all_of_it_offline(tmp_path: Path) -> None:
+    """Where a browser is: every figure is drawn, with the page's own policy on."""
+    text, figures = compose(run_of([Made("<b>N1", 10), Made("N2", 10, loss=0.1)], require=LIMITS))
+    path = tmp_path / "report.html"
+    path.write_text(text, encoding="utf-8")
+    drawn = shown(path)
+    plots = [each for each in drawn.split('class="')[1:] if each.startswith("plot js-plotly-plot")]
+    assert len(plots) == len(figures)
+    assert drawn.count('class="main-svg"') >= len(figures)
+    assert "modebar-btn" in drawn and "sendDataToCloud" not in drawn.partition("<script>")[0]
+
+
+@pytest.mark.peer
+@pytest.mark.slow
+@pytest.mark.parametrize(("width_px", "higher_px"), [(500, 40), (1300, 0)])
+def test_words_beside_bars_stand_below_them_where_it_is_narrow(width_px: int, higher_px: int, tmp_path: Path) -> None:
+    text, figures = compose(run_of([Made("N1", 4), Made("N2", 4)], fits=False))
+    (windows,) = (figure for figure in figures if figure.name == "windows")
+    path = tmp_path / "report.html"
+    path.write_text(text, encoding="utf-8")
+    (plot,) = re.findall(
+        r'<div class="plot[^>]*aria-label="Share of control windows[^>]*>', shown(path, f"--window-size={width_px},900")
+    )
+    assert f"height: {windows.height_px + higher_px}px" in plot.replace("height:", "height: ").replace("  ", " ")

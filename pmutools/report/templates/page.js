@@ -6,11 +6,23 @@
     modeBarButtons: [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
     toImageButtonOptions: { format: "svg" },
   };
+  // Words at the right of the bars would leave a narrow plot no room: there they stand below the bars.
+  const notesBelow = (plot, { data, layout }) => {
+    const notes = (layout.annotations ?? []).filter((note) => note.xref === "paper" && note.x === 1);
+    if (!notes.length) return;
+    layout.margin.r = 12;
+    layout.height += 20 * notes.length;
+    plot.style.height = `${layout.height}px`;
+    layout.yaxis.range = [notes.length - 0.3, -0.5];
+    for (const bar of data) if (bar.orientation === "h") bar.width = 0.4;
+    for (const note of notes) Object.assign(note, { x: 0, xshift: 0, y: note.y + 0.2, yanchor: "top" });
+  };
   const plots = [...document.querySelectorAll(".plot")];
   const draw = (plot) => {
     if (plot.dataset.drawn) return;
     plot.dataset.drawn = "yes";
     const spec = JSON.parse(plot.nextElementSibling.textContent);
+    if (plot.clientWidth < 600) notesBelow(plot, spec);
     Plotly.newPlot(plot, spec.data, spec.layout, config);
   };
 
