@@ -65,7 +65,12 @@ def effective(settings: Settings) -> list[Effective]:
         ("log", settings.log),
     ):
         rows += _of(section, values, ("samples",))
-    return rows
+    return [_given(row) if (row.section, row.key) in settings.given else row for row in rows]
+
+
+def _given(row: Effective) -> Effective:
+    """A row that the file gives, be it by chance what the default is."""
+    return row._replace(source=GIVEN)
 
 
 def _priority(settings: Settings) -> Effective:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from dcon.core.clash import Clash
-from dcon.core.params import Line, Pair, Params, PmuParams, Required
+from dcon.core.params import RATES, Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
@@ -26,13 +27,14 @@ from pmutools.sites import Site, endpoint, read_ini, sites_of
 PARAMS = {item.name: item for item in fields(Params)}
 ELSEWHERE = frozenset(("pmus", "instances", "rate_hz", "thresholds", "line", "required", "probing"))
 """Fields of Params that other sections fill: no keys of ``[controller]``."""
-_RATE = PARAMS["rate_hz"].metadata
 GAIN_MAX = Params.gain_max_mw_per_mhz
 """MW/mHz that a line may be controlled with."""
 RATE_HZ = 60
 """Of a PMU whose section names none."""
 PROBE_BYTES = 16 << 20
 """Largest file of a probing signal."""
+PROBE_FILE = "probing.file"
+"""The setting that names it."""
 TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
 _SEPARATORS = " ,()"
 """In lists of instances."""
@@ -233,6 +235,8 @@ class Settings:
     probe_file: bytes = b""
     """What ``file`` of ``[probing]`` names, for the log."""
     line_input: LineInput = LineInput()
+    given: frozenset[tuple[str, str]] = frozenset()
+    """(section, key) of what the file gives, be it what the default is."""
 
 
 def load(path: str | Path) -> Settings:
@@ -242,11 +246,24 @@ def load(path: str | Path) -> Settings:
     """
     ini, text = read_ini(path)
     settings = from_ini(ini, text)
+    _spared(settings, ini, path)
     most = settings.params.gain_max_mw_per_mhz
     if most > GAIN_MAX:
         where = ini.section("controller").entries["gain_max_mw_per_mhz"].where
         raise where.error(f"{most:g} MW/mHz is above {GAIN_MAX:g}; only simulations and replays go beyond it")
     return settings
+
+
+def _spared(settings: Settings, ini: Ini, path: str | Path) -> None:
+    """Raise SettingsError where what is written is a file that is read, under whatever name."""
+    read = {"the initialisation file": path, "the probing signal": settings.params.probing.file}
+    read["the file of keys"] = settings.server.keys or ""
+    for section, key, written in (("log", "path", settings.log.path), ("watchdog", "log", settings.watchdog.log)):
+        for what, name in read.items():
+            if all(place and os.path.exists(place) for place in (written, name)) and os.path.samefile(written, name):
+                entry = ini.section(section).entries.get(key)
+                where = ini.section(section).where._replace(key=key) if entry is None else entry.where
+                raise where.error(f"{written} is {what}, and would be overwritten; write to another file")
 
 
 def parse(text: str, source: str, changes: tuple[str, ...] = (), *, probe_file: bytes | None = None) -> Settings:
@@ -257,6 +274,8 @@ def parse(text: str, source: str, changes: tuple[str, ...] = (), *, probe_file: 
     ini = parse_ini(text, source, defaults_for="pmu")
     for change in changes:
         ini = ini.changed(change)
+        if change.partition("=")[0].strip().lower() == PROBE_FILE:
+            probe_file = None  # what was recorded is not what is asked for
     return from_ini(ini, text, probe_file)
 
 
@@ -268,6 +287,9 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
     probing, probe_file = probing_of(ini.section("probing"), probe_file)
     try:
         params = _params(ini, sites, required, probing)
+        if platform.phase_ms >= (period_ms := 1e3 / params.tick_hz):
+            problem = f"{platform.phase_ms:g}: must be below the {period_ms:.1f} ms from tick to tick"
+            raise Clash(problem, "platform.phase_ms", "controller.tick_hz")
     except Clash as clash:
         raise _placed(clash, ini, "controller") from None
     return Settings(
@@ -281,6 +303,7 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
         text,
         probe_file,
         line_input=fill(LineInput, _split(ini.section("pdci"), LineInput)[0]),
+        given=frozenset((section.name, key) for section in ini.sections for key in section.entries),
     )
 
 
@@ -320,6 +343,13 @@ def _column(entry: Entry, data: bytes, column: str) -> tuple[float, ...]:
     return tuple(samples)
 
 
+def frames_per_s(text: str) -> int:
+    """A parser: the rates of the controller's differentiator."""
+    if (rate := integer()(text)) not in RATES:
+        raise ValueError(f"{text} is not one of {', '.join(map(str, RATES))} frames/s")
+    return rate
+
+
 def rate_of(site: Site) -> int:
     """Frames per second."""
     return RATE_HZ if site.rate is None else site.rate
@@ -328,7 +358,7 @@ def rate_of(site: Site) -> int:
 def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Probing) -> Params:
     for section, site in zip(ini.family("pmu"), sites, strict=True):
         if entry := section.entries.get("rate"):
-            entry.read(integer(_RATE["low"], _RATE["high"]))
+            entry.read(frames_per_s)
         if rate_of(site) != rate_of(sites[0]):
             entry = entry or section.entries["url"]
             raise entry.where.error(
@@ -346,7 +376,10 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
         entry = entries.get("gain_mw_per_mhz") or entries["gain_max_mw_per_mhz"]
-        raise entry.where.error(f"{gain:g} MW/mHz is above gain_max_mw_per_mhz = {most:g}; 9 to 15 are usable")
+        raise entry.where.error(
+            f"{gain:g} MW/mHz is above gain_max_mw_per_mhz = {most:g}; 9 to 15 are usable, "
+            "a simulation or replay may set controller.gain_max_mw_per_mhz too"
+        )
     try:
         return Params(
             pmus=tuple(PmuParams(site.name, site.nominal_kv) for site in sites),

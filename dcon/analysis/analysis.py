@@ -19,8 +19,7 @@ from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
 from dcon.session.column_tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
 from dcon.session.columns import read_columns
-from dcon.session.newer import Newer
-from dcon.session.parts import part_of
+from dcon.session.parts import Part, named_twice, part_of
 from dcon.settings import parse
 from pmutools.errors import SettingsError, SourceError
 from pmutools.measure.budget import Row
@@ -88,7 +87,7 @@ class Analysis:
                 for name, up in self.flags.items()
             },
             "register": [entry._asdict() for entry in self.register],
-            "orders": [order._asdict() | {"value": _known(order.value)} for order in session.orders[:MOST_EVENTS]],
+            "orders": [order._asdict() | {"value": _known(order.given)} for order in session.orders[:MOST_EVENTS]],
             "events": [event._asdict() for event in session.events[:MOST_EVENTS]],
             "events_total": len(session.events),
             "switches": [switch._asdict() for switch in self.switches[:MOST_EVENTS]],
@@ -108,8 +107,8 @@ def _spreads(row: Any, *names: str) -> dict[str, Any]:
     return {name: getattr(row, name)._asdict() for name in names}
 
 
-def _known(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _known(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None
 
 
 @dataclass
@@ -164,7 +163,7 @@ def analyze_all(paths: Sequence[str | os.PathLike[str]], tell: Tell | None = Non
     """Analyse sessions: parts of one session are put together, and sessions into the order of their times.
 
     ``look`` is shown each session while its columns are in memory; after that only events and orders are, so that
-    memory is bounded by one session. Raises SourceError where nothing of any file could be read.
+    memory is bounded by one session. Raises SourceError where nothing of any file could be read, or one is named twice.
     """
     outcome = Outcome()
     for group in _sessions(paths, outcome.unread):
@@ -197,15 +196,19 @@ def _slim(session: SessionColumns) -> SessionColumns:
 def _sessions(
     paths: Sequence[str | os.PathLike[str]], unread: list[tuple[str, str]]
 ) -> Iterator[list[str | os.PathLike[str]]]:
-    """The files of each session; those that are none go to ``unread``."""
+    """The files of each session; those that are none go to ``unread``. Raises SourceError for a part named twice."""
     groups: dict[str, list[str | os.PathLike[str]]] = {}
-    for path in dict.fromkeys(paths):
+    met: dict[tuple[str, int], Part] = {}
+    for path in paths:
         try:
             part = part_of(path)
         except SourceError as error:
             unread.append((str(path), str(error)))
             continue
-        groups.setdefault(part.session or str(path), []).append(path)
+        session = part.session or os.path.realpath(path)
+        if (before := met.setdefault((session, part.number), part)) is not part:
+            raise named_twice(before, part)
+        groups.setdefault(session, []).append(path)
     yield from groups.values()
 
 
@@ -223,7 +226,7 @@ def analyze(paths: Sequence[str | os.PathLike[str]]) -> Analysis:
     gaps = course.gaps(session, rate_hz)
     loop = loop_of(session, rate_hz, limit_mw)
     found = ringdowns(loop, session.gaps)
-    notes += [f"{Path(name).name}: {line}" for line in session.damage.lines()]
+    notes += [f"{Path(name).name}: {line}" for line in (*session.missing, *session.damage.lines())]
     if session.incomplete_ticks:
         notes.append(f"{session.incomplete_ticks} ticks say nothing of their instances")
     return Analysis(
@@ -234,7 +237,7 @@ def analyze(paths: Sequence[str | os.PathLike[str]]) -> Analysis:
         begin_ns=int(ticks.min()),
         end_ns=int(ticks.max()) + round(NS / rate_hz),
         notes=notes,
-        damaged=bool(session.damage) or bool(session.incomplete_ticks),
+        damaged=bool(session.damage or session.incomplete_ticks or session.missing),
         states=course.states(session, rate_hz),
         modes=course.modes(session, rate_hz),
         actives=course.actives(session, rate_hz),

@@ -14,6 +14,7 @@ from dcon.analysis.course import Stretch
 from dcon.analysis.disturbances import Floats
 from dcon.analysis.numbers import delays_ms
 from dcon.analysis.ringdowns import Comparison, Mode, Ringdown
+from dcon.core.values import words_of
 from dcon.session.column_tables import INSTANCE_STATES, UNKNOWN
 from pmutools.modal.matrix_pencil import ANALYSIS_HZ, ringdown
 from pmutools.report import theme
@@ -129,7 +130,7 @@ def _timeline(session: Analysis, stem: str, shown_ms: tuple[float, float]) -> Fi
                 np.full(len(orders), float(len(names))),
                 theme.INK,
                 "diamond",
-                [f"{utc(o.tick_ns, 3)}: {o.name} {o.value:g} {o.text} {o.who}".rstrip() for o in orders],
+                [f"{utc(o.tick_ns, 3)}: {words_of(o.name, o.given, o.text, o.who)}" for o in orders],
             )
         )
         names.append("orders")

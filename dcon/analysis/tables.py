@@ -132,7 +132,7 @@ def register_table(session: Analysis, stem: str) -> Table:
 def order_table(session: Analysis, stem: str) -> Table:
     columns = (Column("when", "UTC", words=_W), Column("order", words=_W), Column("value"), Column("what", words=_W))
     rows = [
-        _row((utc(o.tick_ns, 3), o.tick_ns), o.name, f"{o.value:g}", o.text, o.who, o.why)
+        _row((utc(o.tick_ns, 3), o.tick_ns), o.name, NONE if o.given is None else f"{o.given:g}", o.text, o.who, o.why)
         for o in session.columns.orders[:MOST_ROWS]
     ]
     return Table(

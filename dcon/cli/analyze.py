@@ -22,7 +22,7 @@ def command(sessions: tuple[str, ...], out: Path, as_json: bool, quiet: bool, ve
     Writes report.html (one file, works offline), figures/ (PNG and SVG) and analysis.json to DIR. The first part of a
     session brings those that follow it; several sessions are put into the order of their times.
 
-    Exit code 3 says that something of the logs could not be read; the report says what.
+    Exit code 3 says that something of the logs is missing or could not be read; the report says what.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: for matrices this small threads only cost
     from dcon.analysis.report import JSON, PAGE, main_findings, write_analysis
@@ -39,6 +39,9 @@ def command(sessions: tuple[str, ...], out: Path, as_json: bool, quiet: bool, ve
             click.echo(sentence)
     for files, found in outcome.newer:
         talk.say(f"warning: {files[0]} {found}")
+    for session in outcome.sessions:
+        for line in session.columns.missing:
+            talk.say(f"{session.files[0]}: {line}")
     for _, why in outcome.unread:
         talk.say(f"not read: {why}")
     talk.say(f"report: {out / PAGE}, {out / JSON}")

@@ -21,7 +21,7 @@ def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, q
 
     The first part of a session brings those that follow it; or name the parts.
 
-    Exit code 3 says that part of the log could not be read.
+    Exit code 3 says that part of the log is missing or could not be read.
     """
     from dcon.session.export import export
 
@@ -30,10 +30,10 @@ def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, q
     summary = export(sessions, output, table)
     if as_json:
         said = {"rows": summary.rows, "gaps": summary.gaps, "damage": summary.damage.lines()}
-        click.echo(json.dumps(said | {"newer": summary.newer.to_json()}))
+        click.echo(json.dumps(said | {"newer": summary.newer.to_json(), "missing": summary.missing}))
     talk.say(f"{summary.rows} rows -> {output}")
     if summary.newer:
         talk.say(f"warning: {sessions[0]} {summary.newer}")
-    for line in summary.damage.lines():
+    for line in (*summary.missing, *summary.damage.lines()):
         talk.say(f"{sessions[0]}: {line}")
-    return Exit.INCOMPLETE if summary.gaps or summary.damage else Exit.DONE
+    return Exit.INCOMPLETE if summary.gaps or summary.damage or summary.missing else Exit.DONE

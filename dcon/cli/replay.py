@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dcon.cli.spare import spare
-from pmutools.cli.shell import Exit, Talk, common
+from dcon.cli.spare import named_in, spare
+from pmutools.cli.shell import Exit, Parsed, Talk, common
 from pmutools.errors import SettingsError, SourceError
+from pmutools.parsers import duration_ns
+from pmutools.timebase import NS
 
 if TYPE_CHECKING:
     from dcon.core.values import Record
@@ -26,9 +28,21 @@ TOLD_TICKS = 3600
 @click.argument("sessions", metavar="SESSION...", nargs=-1, required=True)
 @click.option("--set", "changes", multiple=True, metavar="SECTION.KEY=VALUE", help="Change a setting; repeatable.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Commands as CSV.")
+@click.option(
+    *("--duration", "duration_ns"),
+    type=Parsed(duration_ns(NS, 0.001)),
+    metavar="S",
+    help="Stop after S seconds of the session.",
+)
 @common
 def command(
-    sessions: tuple[str, ...], changes: tuple[str, ...], out: Path | None, as_json: bool, quiet: bool, verbose: int
+    sessions: tuple[str, ...],
+    changes: tuple[str, ...],
+    out: Path | None,
+    duration_ns: int | None,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
 ) -> int:
     """Replay a session log, tick by tick, from its logged bytes and arrivals.
 
@@ -41,7 +55,7 @@ def command(
 
     talk = Talk(quiet, verbose)
     if out is not None:
-        spare(out, sessions)
+        spare(out, (*sessions, *named_in(changes)))
         if out.suffix.lower() == ".mcap":
             raise SettingsError(f"--out {out}: commands are written as CSV; name it {out.with_suffix('.csv').name}")
     replayed = itertools.count(1)
@@ -52,7 +66,7 @@ def command(
             if (count := next(replayed)) % TOLD_TICKS == 0:
                 talk.progress(f"{count} ticks")
 
-        result = replay(sessions, changes, observe)
+        result = replay(sessions, changes, observe, duration_ns)
     talk.progress("")
     if as_json:
         click.echo(json.dumps(result.to_json()))

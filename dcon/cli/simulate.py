@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dcon.cli.spare import keep_sessions
+from dcon.cli.spare import keep_sessions, spare_in
 from pmutools.cli.shell import Parsed, Talk, common
 from pmutools.errors import SourceError
-from pmutools.parsers import integer, number
+from pmutools.parsers import number
 
 if TYPE_CHECKING:
     from dcon.sim.simulate import Outcome
@@ -24,11 +24,9 @@ RESULT = "result.json"
 
 
 def _rate(text: str) -> int:
-    from dcon.sim.plan import RATES
+    from dcon.settings import frames_per_s
 
-    if (rate := integer()(text)) not in RATES:
-        raise ValueError(f"{text} is not one of {', '.join(map(str, RATES))} frames/s")
-    return rate
+    return frames_per_s(text)
 
 
 @click.command(name="simulate", short_help="A scenario in virtual time, through the same bytes and the same engine.")
@@ -86,7 +84,7 @@ def command(
     from pmutools.impair.profile import Profile
     from pmutools.impair.profiles import load_profile
 
-    talk = Talk(quiet, verbose)
+    talk, control = Talk(quiet, verbose), not no_control
     plan = Plan(
         scenario=scenario_name,
         plant=plant,
@@ -96,7 +94,7 @@ def command(
         deadband_mhz=deadband,
         faults=faults,
         profile=Profile() if impair is None else load_profile(impair),
-        control=not no_control,
+        control=control,
         align=not no_align,
         interpolate_single_loss=interpolate,
         duration_s=duration,
@@ -107,6 +105,7 @@ def command(
     sweep = runs(plan, axes, out)
     if out is not None:
         with _naming(out):
+            spare_in(out, (RESULT,), () if impair is None else (impair,))
             keep_sessions([run.path for run in sweep if run.path])
             out.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
@@ -118,8 +117,12 @@ def command(
         if as_json:
             click.echo(("[\n" if number_ == 1 else "") * bool(axes) + json.dumps(results[-1]), nl=False)
             click.echo(",\n" if number_ < len(sweep) else "\n]\n" if axes else "\n", nl=False)
+        elif quiet:
+            pass
         elif axes:
             click.echo("\n".join(_rows(run, outcome, axes)[number_ > 1 :]))
+            if outcome.mode is None and control:
+                talk.say(f"run {number_}: {outcome.mode_reason}")
         else:
             click.echo(_text(outcome))
     if out is not None:
@@ -149,7 +152,7 @@ def _rows(run: Run, outcome: Outcome, axes: list[Axis]) -> list[str]:
     """The head of a sweep's table, and the row of one run."""
     from dcon.sim.sweep import SWEPT
 
-    mode = outcome.mode or outcome.open_loop
+    mode = outcome.mode if outcome.plan.control else outcome.open_loop
     cells = [(f"{axis.name} {SWEPT[axis.name].unit}".strip(), f"{run.swept[axis.name]:g}") for axis in axes]
     cells += [
         ("frequency Hz", f"{mode.frequency_hz:.4f}" if mode else "-"),
@@ -172,6 +175,8 @@ def _text(outcome: Outcome) -> str:
     for name, mode in (("open loop", outcome.open_loop), ("closed loop", outcome.mode)):
         if mode is not None:
             lines.append(f"  {name:<12} {mode.frequency_hz:.4f} Hz  {mode.damping_percent:6.2f} %  (R² {mode.r2:.4f})")
+    if outcome.mode is None:
+        lines.append(f"  closed loop  {outcome.mode_reason}")
     lines.append(f"  peak command {outcome.peak_command_mw:.1f} MW, final state {outcome.final_state}")
     lines += [
         f"  {time_s:9.3f} s  {event.name:<22} {event.subject} {event.detail}".rstrip()

@@ -22,6 +22,14 @@ def spare_in(folder: Path, names: Sequence[str], sessions: Sequence[str]) -> Non
             spare(path, sessions)
 
 
+def named_in(changes: Sequence[str]) -> list[str]:
+    """Files that changes of settings (``SECTION.KEY=VALUE``) name to be read."""
+    from dcon.settings import PROBE_FILE
+
+    pairs = (change.partition("=") for change in changes)
+    return [text.strip() for key, _, text in pairs if key.strip().lower() == PROBE_FILE]
+
+
 def keep_sessions(paths: Sequence[str | Path]) -> None:
     """Raise SettingsError if there is a file already where a session is to be logged."""
     for path in map(Path, paths):
@@ -31,11 +39,8 @@ def keep_sessions(paths: Sequence[str | Path]) -> None:
 
 def _files(sessions: Sequence[str]) -> Iterator[str]:
     """The files named, and those beside them that may be their further parts."""
-    from dcon.session.parts import part_path
+    from dcon.session.parts import later_paths
 
     for session in sessions:
         yield session
-        number = 2
-        while (path := part_path(session, number)).exists():
-            yield str(path)
-            number += 1
+        yield from map(str, later_paths(session).values())

@@ -21,6 +21,8 @@ from dcon.limiter import LIMIT_MW
 from pmutools.errors import SettingsError
 
 NS = 1_000_000_000
+RATES = (30, 50, 60, 100, 120)
+"""Frames per second that the differentiator is designed for, and judged at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +92,8 @@ class Params:
     """Taken off |Δf|."""
     limit_mw: float = setting(LIMIT_MW, "MW", "section I", 0, LIMIT_MW)
     """Largest command, either sign."""
-    rate_hz: int = setting(60, "frames/s", "section III", 6, 240)
-    """Reporting rate of every PMU."""
+    rate_hz: int = setting(60, "frames/s", "section III", RATES[0], RATES[-1])
+    """Reporting rate of every PMU: one of :data:`RATES`."""
     tick_hz: int = setting(60, "1/s", "section IV", 6, 1000)
     """Rate of the control loop."""
     nominal_hz: float = setting(60.0, "Hz", "the Western Interconnection", 50, 60)
@@ -100,7 +102,7 @@ class Params:
     """Subtract frequencies of identical stamps (section V.C); False only to show why (Figs. 13-15)."""
     interpolate_single_loss: bool = field(default=False, metadata={"source": "section V.B: a dropout disables"})
     """Bridge exactly one lost frame by its midpoint (section V.B, Algorithm 1) and stay READY."""
-    init_s: float = setting(20.0, "s", "section IV: approximately 20 s", 0, 3600)
+    init_s: float = setting(20.0, "s", "section IV: approximately 20 s", 0.1, 3600)
     """Valid data, from both PMUs, before an instance is READY after any disable."""
     return_s: float = setting(60.0, "s", "choice", 0, 86400)
     """An instance of higher priority takes over in ACTIVE only when READY for so long."""
@@ -192,6 +194,8 @@ class Params:
 def check_together(params: Params) -> None:
     """Raise Clash for settings of different sections that exclude each other."""
     limits, line, probing, tick_hz = params.thresholds, params.line, params.probing, params.tick_hz
+    if params.rate_hz not in RATES:
+        raise SettingsError(f"rate_hz = {params.rate_hz}: must be one of {', '.join(map(str, RATES))} frames/s")
     if params.nominal_hz not in (50, 60):
         raise Clash(f"{params.nominal_hz:g}: C37.118 has 50 and 60 Hz only", "controller.nominal_hz")
     for key in ("ringing_high_hz", "growth_high_hz"):

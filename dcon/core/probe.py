@@ -76,6 +76,9 @@ class Probing:
             raise Clash(f"{problem}; {LONGEST_S:g} s at most", "cycles", "frequency_hz")
         if self.kind == "multisine" and self.low_hz * self.period_s < 1:
             raise Clash(f"{self.low_hz:g}: no whole cycle in period_s = {self.period_s:g}", "low_hz", "period_s")
+        if self.kind == "multisine" and self.period_s > self.duration_s:
+            problem = f"{self.period_s:g}: above duration_s = {self.duration_s:g}, so that no tone comes whole"
+            raise Clash(problem, "period_s", "duration_s")
         if self.kind in SWEPT and 2 * self.ramp_s > self.duration_s:
             raise Clash(f"{self.ramp_s:g}: more than half of duration_s = {self.duration_s:g}", "ramp_s", "duration_s")
         if self.kind == "file" and not self.samples:

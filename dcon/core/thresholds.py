@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
-from dcon.core.clash import check_order
+from dcon.core.clash import Clash, check_order
 from pmutools.errors import SettingsError
 
 RING_SIZE = 32
@@ -45,6 +45,8 @@ ASCENDING: Final = (
 )
 """Pairs of which the first must be below the second: warnings come before what they warn of, bands have a width, and
 frames that are not even late are not too old to be aligned."""
+INTER_AREA_HZ: Final = 1.0
+"""Inter-area modes, which the command is to follow, are below; what rings is above."""
 
 
 @dataclass(frozen=True)
@@ -154,3 +156,12 @@ class Thresholds:
     def __post_init__(self) -> None:
         check_bounds(self)
         check_order(self, ASCENDING)
+        if not self.voltage_min_pu < 1:
+            raise Clash(f"{self.voltage_min_pu:g}: must be below 1, or nominal voltage disables", "voltage_min_pu")
+        if not self.voltage_max_pu > 1:
+            raise Clash(f"{self.voltage_max_pu:g}: must be above 1, or nominal voltage disables", "voltage_max_pu")
+        if not self.saturation_max_percent < 100:
+            raise Clash("100: must be below 100, no share is above it", "saturation_max_percent")
+        if not self.ringing_low_hz > INTER_AREA_HZ:
+            problem = f"{self.ringing_low_hz:g}: must be above {INTER_AREA_HZ:g} Hz, the band of what is to be damped"
+            raise Clash(problem, "ringing_low_hz")

@@ -56,6 +56,16 @@ class Sample(NamedTuple):
     """Negative-sequence voltage, V RMS; NaN where the three phases are not given."""
 
 
+def value_of(order: str, value: float) -> float | None:
+    """The value of an order of that name; None where it takes none, and has none."""
+    return value if order == "gain" or value else None
+
+
+def words_of(order: str, value: float | None, *others: str) -> str:
+    """An order as it is shown."""
+    return " ".join(word for word in (order, "" if value is None else f"{value:g}", *others) if word)
+
+
 class Order(NamedTuple):
     """An operator's order or a setting, taken by the next tick. Names: ``ORDERS`` in :mod:`dcon.core.system`."""
 
@@ -67,6 +77,15 @@ class Order(NamedTuple):
     """Who ordered it."""
     why: str = ""
     """In the operator's words."""
+
+    @property
+    def given(self) -> float | None:
+        """``value``, where the order has one."""
+        return value_of(self.name, self.value)
+
+    def __str__(self) -> str:
+        """What is ordered, in words: ``gain 12``, ``ack ringing``."""
+        return words_of(self.name, self.given, self.text)
 
 
 class Pdci(NamedTuple):

@@ -243,7 +243,8 @@ class Platform:
     def _tell(self, news: LinkEvent) -> None:
         self._told[news.kind] += 1
         level = logging.WARNING if news.kind in TROUBLE and self._told[news.kind] <= TOLD else logging.INFO
-        LOG.log(level, "%s: %s %s", news.label or news.where, news.kind, news.detail)
+        kind = "" if news.kind is LinkKind.NOTHING else f"{news.kind} "  # that nothing came is what the detail says
+        LOG.log(level, "%s: %s%s", news.label or news.where, kind, news.detail)
 
     def _configure(self, name: str, frame: Frame) -> None:
         engine = self.engine

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dcon.core.values import Flag, InstanceState, Mode, SystemState
+from dcon.core.values import Flag, InstanceState, Mode, SystemState, value_of
 from dcon.session.codec import Watchdog
 from dcon.session.newer import Newer
 from pmutools.flow import StampSource
@@ -106,6 +106,11 @@ class OrderRow(NamedTuple):
     who: str
     why: str = ""
 
+    @property
+    def given(self) -> float | None:
+        """``value``, where the order has one."""
+        return value_of(self.name, self.value)
+
 
 class FlagRow(NamedTuple):
     """An entry of the flag register that changed in a tick, as it was then."""
@@ -141,6 +146,8 @@ class SessionColumns:
     """Of all parts; ``cut`` alone means no loss but that of the end."""
     newer: Newer = field(default_factory=Newer)
     """What the log holds that this program does not know."""
+    missing: list[str] = field(default_factory=list)
+    """What is not there between the parts, in words."""
 
     def flag(self, name: str) -> npt.NDArray[np.bool_]:
         """(T,) whether a flag is up at each tick. Raises KeyError for a name that the session lacks."""

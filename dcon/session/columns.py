@@ -275,6 +275,7 @@ class _Builder:
             incomplete_ticks=self._incomplete,
             damage=reader.damage,
             newer=newer_in(reader),
+            missing=reader.missing,
         )
 
 

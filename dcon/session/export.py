@@ -35,6 +35,8 @@ class ExportSummary(NamedTuple):
     gaps: int
     damage: Damage
     newer: Newer = Newer()
+    missing: tuple[str, ...] = ()
+    """What is not there between the parts, in words."""
 
 
 def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
@@ -67,7 +69,7 @@ def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> 
             raise
         reason = os.strerror(error.errno) if error.errno else error  # pyarrow's own text is long, and names the path
         raise SourceError(f"{out}: cannot write: {reason}") from None
-    return ExportSummary(count, rows.gaps, reader.damage, newer_in(reader))
+    return ExportSummary(count, rows.gaps, reader.damage, newer_in(reader), tuple(reader.missing))
 
 
 class _Rows:

@@ -15,7 +15,7 @@ from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surro
 from dcon.session import codec
 from dcon.session.codec import Timing
 from dcon.session.head import INI_NAME, PROBE_NAME
-from dcon.session.parts import SESSION, Part, Paths, is_apart, parts_of
+from dcon.session.parts import SESSION, Part, Paths, is_apart, missing, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.messages import MESSAGES
@@ -98,6 +98,11 @@ class SessionReader:
     def damage(self) -> Damage:
         """Of all parts together."""
         return sum((part.log.damage for part in self.parts), start=Damage())
+
+    @property
+    def missing(self) -> list[str]:
+        """What is not there between the parts, in words."""
+        return missing(self.parts)
 
     def ticks(self) -> Iterator[LoggedTick]:
         """Every whole tick with its inputs, in file order."""

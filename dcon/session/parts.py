@@ -87,8 +87,9 @@ def part_of(path: str | os.PathLike[str]) -> Part:
 def parts_of(paths: Paths) -> list[Part]:
     """The parts to be read, in order.
 
-    A first part brings those that continue it, as far as they are there; a later one stands alone; several are taken
-    as named, whatever their order. Raises SourceError for files that are not parts of one session, or one named twice.
+    A first part brings those of its session that are beside it, with gaps where some are not; a later one stands
+    alone; several are taken as named, whatever their order. Raises SourceError for files that are not parts of one
+    session, or one named twice.
     """
     named = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     parts = sorted(map(part_of, named), key=lambda part: part.number)
@@ -98,7 +99,7 @@ def parts_of(paths: Paths) -> list[Part]:
             if not part.session or part.session != first.session:
                 raise SourceError(f"{part.log.path}: not of the same session as {first.log.path}; read one at a time")
             if part.number == before.number:
-                raise SourceError(f"{part.log.path}: part {part.number} of the session twice, also {before.log.path}")
+                raise named_twice(before, part)
         return parts
     (only,) = parts
     if only.number == 1 and only.session:
@@ -106,21 +107,49 @@ def parts_of(paths: Paths) -> list[Part]:
     return parts
 
 
+def named_twice(one: Part, other: Part) -> SourceError:
+    """What is to be raised for two files that are the same part of a session."""
+    return SourceError(f"{other.log.path}: part {other.number} of the session twice, also {one.log.path}")
+
+
+def missing(parts: Sequence[Part]) -> list[str]:
+    """What is not there between the parts of a session, in words; damage within a part is told by its reader."""
+    lines: list[str] = []
+    for before, part in pairwise(parts):
+        absent = [str(number) for number in range(before.number + 1, part.number)]
+        if absent:
+            which = f"part {absent[0]} is" if len(absent) == 1 else f"parts {absent[0]} to {absent[-1]} are"
+            lines.append(f"{which} missing, part {part.number} is there")
+        if part.unlogged:
+            lines.append(f"{part.unlogged} ticks before part {part.number} were not logged")
+    return lines
+
+
 def is_apart(before: Part, part: Part) -> bool:
     """Whether anything is missing between two parts, the first of which has been read to its end."""
     return bool(before.log.damage or part.unlogged or part.number != before.number + 1)
 
 
+def later_paths(first: str | os.PathLike[str]) -> dict[int, Path]:
+    """The files beside ``first`` that are named as its further parts, by their numbers, ascending."""
+    path = Path(first)
+    named = re.compile(rf"{re.escape(path.stem)}\.part([1-9]\d{{0,8}}){re.escape(path.suffix)}")
+    try:
+        found = {int(match[1]): place for place in path.parent.iterdir() if (match := named.fullmatch(place.name))}
+    except OSError:
+        return {}
+    return {number: found[number] for number in sorted(found) if number > 1 and found[number].is_file()}
+
+
 def _followers(first: Part) -> list[Part]:
     found: list[Part] = []
-    while (path := part_path(first.log.path, len(found) + 2)).is_file():
+    for number, path in later_paths(first.log.path).items():
         try:
             part = part_of(path)
         except SourceError:
-            break
-        if (part.session, part.number) != (first.session, len(found) + 2):
-            break
-        found.append(part)
+            continue
+        if (part.session, part.number) == (first.session, number):
+            found.append(part)
     return found
 
 

@@ -73,7 +73,9 @@ class Difference:
             f"{math.degrees(cmath.phase(frame.v1)):.4f}°, {frame.frequency_hz:.6f} Hz, STAT {frame.stat:#06x}"
             for frame in self.frames
         ]
-        inputs += [f"order: {order.name} {order.value:g}" for order in self.orders]
+        inputs += [
+            f"order: {order.name}" + (f" {order.given:g}" if order.given is not None else "") for order in self.orders
+        ]
         what = f"tick {self.tick_ns}: {self.field} {self.recorded!r} -> {self.replayed!r}"
         return "\n  ".join((what, *(inputs if self.frames or self.orders else [*inputs, "no frames"])))
 
@@ -96,7 +98,7 @@ class Difference:
                 }
                 for frame in self.frames
             ],
-            "orders": [{"name": order.name, "value": _plain(order.value)} for order in self.orders],
+            "orders": [{"name": order.name, "value": _plain(order.given)} for order in self.orders],
         }
 
 
@@ -139,11 +141,13 @@ class Replay:
         }
 
 
-def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None = None) -> Replay:
+def replay(
+    paths: Paths, changes: Sequence[str] = (), observe: Observer | None = None, duration_ns: int | None = None
+) -> Replay:
     """Replay a session log, with ``SECTION.KEY=VALUE`` changes laid over its settings.
 
-    ``observe`` is shown every tick. Raises SourceError for what is no session log or not its beginning, SettingsError
-    for settings that cannot be.
+    ``observe`` is shown every tick. Ticks ``duration_ns`` after the first, and later ones, are left out. Raises
+    SourceError for what is no session log or not its beginning, SettingsError for settings that cannot be.
     """
     reader = SessionReader(paths)
     if reader.parts[0].number > 1:
@@ -158,10 +162,16 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
     result = Replay(changes=tuple(changes))
     before = "the session begins"
+    ended, end_ns = False, math.inf
     for group in reader.groups(TICK_MESSAGES):
         logged = group.one("Tick")
+        if not result.ticks and duration_ns is not None:
+            end_ns = group.tick_ns + duration_ns
+        if group.tick_ns >= end_ns:
+            ended = True
+            break
         if group.after_loss:
-            result.stopped = f"the log lost something before tick {group.tick_ns}"
+            result.stopped = "; ".join((f"the log lost something before tick {group.tick_ns}", *reader.missing))
             break
         if logged is None or group.one("Instance") is None:
             result.stopped = f"tick {group.tick_ns} is not whole"
@@ -192,8 +202,8 @@ def replay(paths: Paths, changes: Sequence[str] = (), observe: Observer | None =
     version = reader.metadata.get("version", "")
     if result.different and not changes and version != pmutools.__version__:
         result.problems.append(f"recorded by version {version or 'unknown'}, replayed by {pmutools.__version__}")
-    if not result.stopped and reader.damage:
-        result.stopped = "; ".join(reader.damage.lines())
+    if not result.stopped and not ended:
+        result.stopped = "; ".join((*reader.missing, *reader.damage.lines()))
     if not result.ticks and not result.stopped:
         raise SourceError(f"{reader.path}: holds no tick")
     return result

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+from dcon.core.values import value_of
 from dcon.session.log import SessionReader, TickMessages
 from pmutools.schema.messages import MESSAGES, Field
 
@@ -37,8 +38,8 @@ class Table:
     rows: Callable[[SessionReader], Rows]
 
 
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _known(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
 
 
 def _column_names(prefix: str, names: tuple[str, ...], suffix: str) -> tuple[Column, ...]:
@@ -165,7 +166,7 @@ def _event_columns(_: SessionReader) -> tuple[Column, ...]:
 def _event_rows(_: SessionReader, group: TickMessages) -> Iterator[Row]:
     """What the operator ordered (an input of the tick), then what happened in it."""
     for order in group.messages.get("Setting", ()):
-        yield group.tick_ns, "order", order.name, None, None, _known(order.value)
+        yield group.tick_ns, "order", order.name, None, None, _known(value_of(order.name, order.value))
     for event in group.messages.get("Event", ()):
         yield group.tick_ns, "event", event.name, event.subject or None, event.detail or None, None
 
@@ -189,11 +190,17 @@ def _message_table(name: str) -> Table:
             for field in fields
         )
 
+    value = _order_value if name == "Setting" else getattr
+
     def rows(group: TickMessages) -> Iterator[Row]:
         for message in group.messages.get(name, ()):
-            yield tuple(_cell(getattr(message, field.name), field) for field in fields)
+            yield tuple(_cell(value(message, field.name), field) for field in fields)
 
     return Table(frozenset((name,)), columns, lambda _: rows)
+
+
+def _order_value(order: Any, field: str) -> Any:
+    return value_of(order.name, order.value) if field == "value" else getattr(order, field)
 
 
 def _cell(value: Any, field: Field) -> int | float | str | bool | None:

@@ -16,8 +16,6 @@ START_NS = timebase.parse_utc("2024-01-01T00:00:00Z")
 FIRST_PORT = 4801
 NOMINAL_HZ = 60.0
 """Of the grid, whatever the rate of its PMUs."""
-RATES = (30, 50, 60, 100, 120)
-"""Frames per second that PMUs report at."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from dcon.core.rows import CORE
 from dcon.core.values import Event, Mode, Pdci, Record
@@ -21,6 +19,7 @@ from dcon.session.head import Head
 from dcon.session.writer import SessionWriter
 from dcon.settings import Settings, parse
 from dcon.sim.delays import Delays, split
+from dcon.sim.judging import Estimate, is_closed, judge, why_unjudged
 from dcon.sim.operator import EagerOperator
 from dcon.sim.plan import NOMINAL_HZ, START_NS, Plan, ini_of
 from dcon.sim.wire import Wire
@@ -37,15 +36,6 @@ from pmutools.grid.signals import Bus
 from pmutools.impair.outgoing import Fate
 from pmutools.impair.pipeline import Pipeline
 from pmutools.impair.profile import Profile, parse_profile
-from pmutools.modal.matrix_pencil import ringdown
-
-
-class Estimate(NamedTuple):
-    """A mode read off a ringdown; ``r2`` is the fit's share of the variance."""
-
-    frequency_hz: float
-    damping_percent: float
-    r2: float
 
 
 @dataclass
@@ -61,12 +51,17 @@ class Outcome:
     events: list[tuple[float, Event]] = field(default_factory=list)
     final_state: str = ""
     peak_command_mw: float = 0.0
+    closed: list[bool] = field(default_factory=list)
+    """Whether the feedback drove the line."""
     mode: Estimate | None = None
+    """Of the closed loop."""
+    mode_reason: str = ""
+    """Why there is none: above all, that the loop was not closed for as long as it is judged."""
     open_loop: Estimate | None = None
 
     def summary(self) -> Outcome:
         """The same without its columns."""
-        return replace(self, swing_mhz=[], tick_s=[], delta_f_mhz=[], command_mw=[])
+        return replace(self, swing_mhz=[], tick_s=[], delta_f_mhz=[], command_mw=[], closed=[])
 
     def to_json(self) -> dict[str, Any]:
         plan = self.plan
@@ -79,6 +74,7 @@ class Outcome:
             "seed": plan.seed,
             "duration_s": plan.length_s,
             "mode": None if self.mode is None else self.mode._asdict(),
+            "mode_reason": self.mode_reason or None,
             "open_loop": None if self.open_loop is None else self.open_loop._asdict(),
             "peak_command_mw": self.peak_command_mw,
             "final_state": self.final_state,
@@ -159,9 +155,12 @@ def simulate(plan: Plan, log_path: str | None = None, tell: Tell | None = None) 
         with SessionWriter(log_path, head, configs) as log:
             _run(plan, delays, senders, engine, outcome, log, tell)
     outcome.peak_command_mw = max(map(abs, outcome.command_mw), default=0.0)
+    outcome.mode_reason = why_unjudged(plan, outcome.tick_s, outcome.closed, outcome.events)
+    if not outcome.mode_reason and (mode := judge(outcome.swing_mhz, plan)) is not None:
+        outcome.mode = mode
+    elif not outcome.mode_reason:
+        outcome.mode_reason = "no inter-area mode is to be seen in the ringdown"
     if plan.course.ringdown_s is not None:
-        if plan.control:
-            outcome.mode = judge(outcome.swing_mhz, plan)
         outcome.open_loop = judge(_uncontrolled(plan), plan)
     return outcome
 
@@ -271,6 +270,7 @@ def _note(outcome: Outcome, record: Record) -> None:
     outcome.tick_s.append(time_s)
     outcome.delta_f_mhz.append(record.delta_f_mhz)
     outcome.command_mw.append(record.command_mw)
+    outcome.closed.append(is_closed(record))
     if record.events:
         outcome.events.extend((time_s, event) for event in record.events)
     outcome.final_state = str(record.state)
@@ -291,16 +291,3 @@ def _uncontrolled(plan: Plan) -> list[float]:
 def _swing_mhz(buses: Mapping[str, Bus]) -> float:
     north, south = buses["north"], buses["south"]
     return (north.deviation_hz - south.deviation_hz + north.common_hz - south.common_hz) * 1e3
-
-
-def judge(swing_mhz: Sequence[float], plan: Plan) -> Estimate | None:
-    """The strongest inter-area mode (0.1 to 1 Hz) of the plan's ringdown; None where there is none to see."""
-    window = plan.course.ringdown_s
-    if window is None:
-        return None
-    start_s, stop_s = window[0], min(window[1], len(swing_mhz) / plan.rate_hz)
-    if stop_s - start_s < 4:
-        return None
-    fit = ringdown(np.array(swing_mhz), plan.rate_hz, start_s, stop_s)
-    mode = fit.dominant()
-    return None if mode is None else Estimate(mode.frequency_hz, 100 * mode.damping, fit.r2)

@@ -43,7 +43,7 @@ def test_a_simulated_session_exports_with_the_documented_columns(
 ) -> None:
     out = tmp_path / f"ticks{suffix}"
     assert run(dcon(), ["export", str(session), str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"rows": 360, "gaps": 0, "damage": [], "newer": None}
+    assert json.loads(capsys.readouterr().out) == {"rows": 360, "gaps": 0, "damage": [], "newer": None, "missing": []}
     if suffix == ".csv":
         rows = list(csv.DictReader(out.read_text().splitlines()))
     elif suffix == ".jsonl":

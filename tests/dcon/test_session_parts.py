@@ -121,11 +121,54 @@ def test_files_that_do_not_belong_together(tmp_path: Path) -> None:
 def test_a_part_that_is_missing_is_a_loss_where_it_was(tmp_path: Path) -> None:
     log = written(tmp_path / "s.mcap", max_minutes=1 / 40)
     log.parts[1].unlink()
-    assert len(stamps(SessionReader(log.path))) == 91
-    reader = SessionReader([log.path, *log.parts[2:]])
-    back = list(reader.ticks())
-    assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 182 * PERIOD_NS]
-    assert len(back) == 309
+    for reader in (SessionReader(log.path), SessionReader([log.path, *log.parts[2:]])):
+        back = list(reader.ticks())
+        assert [tick.record.tick_ns for tick in back if tick.after_loss] == [T0 + 182 * PERIOD_NS]
+        assert len(back) == 309
+        assert reader.missing == ["part 2 is missing, part 3 is there"]
+
+
+def in_parts(tmp_path: Path, *absent: int) -> tuple[Path, list[str]]:
+    """The first part of a session of five without some of its parts, and all that are there."""
+    log = written(tmp_path / "s.mcap", max_minutes=1 / 40)
+    for number in absent:
+        part_path(log.path, number).unlink()
+    there = [path for path in log.parts if path.exists()]
+    assert len(log.parts) == 5
+    return log.parts[0], list(map(str, there))
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["the first", "all"])
+@pytest.mark.parametrize("command", ["export", "analyze", "replay"])
+def test_every_command_says_which_part_is_missing(command: str, named: bool, tmp_path: Path, capsys: Capsys) -> None:
+    first, there = in_parts(tmp_path, 2, 3)
+    out = {"export": [str(tmp_path / "t.csv")], "analyze": ["--out", str(tmp_path / "a")], "replay": []}[command]
+    assert run(dcon(), [command, *(there if named else [str(first)]), *out]) == 3
+    assert "parts 2 to 3 are missing, part 4 is there" in capsys.readouterr().err
+
+
+def test_an_analysis_refuses_a_part_named_twice(tmp_path: Path, capsys: Capsys) -> None:
+    first, there = in_parts(tmp_path)
+    link = tmp_path / "link.mcap"
+    link.symlink_to(first)
+    for paths in ([there[0], there[0]], [there[0], str(link)], [there[1], there[0], there[1]]):
+        assert run(dcon(), ["analyze", *paths, "--out", str(tmp_path / "a")]) == 1
+        said = capsys.readouterr().err
+        assert "of the session twice, also" in said and said.count("\n") == 1
+    plain = write_session(tmp_path / "plain.mcap", TICKS[:5])
+    assert run(dcon(), ["analyze", str(plain), str(plain), "--out", str(tmp_path / "a")]) == 1
+    assert "part 1 of the session twice" in capsys.readouterr().err
+
+
+def test_an_output_is_no_later_part_whatever_is_missing_before_it(tmp_path: Path, capsys: Capsys) -> None:
+    first, there = in_parts(tmp_path, 2)
+    before = Path(there[-1]).read_bytes()
+    assert Path(there[-1]).name == "s.part5.mcap"
+    link = tmp_path / "t.csv"
+    link.symlink_to(there[-1])
+    assert run(dcon(), ["export", str(first), str(link)]) == 2
+    assert "is an input, and would be overwritten" in capsys.readouterr().err
+    assert Path(there[-1]).read_bytes() == before
 
 
 def test_a_cut_part_is_a_loss_at_its_end(tmp_path: Path) -> None:

@@ -17,12 +17,15 @@ import pytest
 
 from dcon.cli import dcon
 from dcon.core.differentiator import coefficients, response
+from dcon.core.params import RATES
+from dcon.core.values import Event
 from dcon.limiter import MW_PER_V
 from dcon.session.columns import read_columns
 from dcon.session.log import SessionReader
 from dcon.session.replay import replay
 from dcon.sim.delays import split
-from dcon.sim.plan import RATES, Plan
+from dcon.sim.judging import why_unjudged
+from dcon.sim.plan import Plan
 from dcon.sim.simulate import SCHEDULE_MW, simulate
 from pmutools.c37118 import decode_config
 from pmutools.cli.shell import run
@@ -32,8 +35,8 @@ from pmutools.impair.profile import parse_profile
 
 Capsys = pytest.CaptureFixture[str]
 KEYS = (
-    *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "rate_hz", "seed", "duration_s", "mode", "open_loop"),
-    *("peak_command_mw", "final_state", "events"),
+    *("scenario", "plant", "gain_mw_per_mhz", "delay_ms", "rate_hz", "seed", "duration_s", "mode"),
+    *("mode_reason", "open_loop", "peak_command_mw", "final_state", "events"),
 )
 
 
@@ -112,7 +115,7 @@ def test_the_parts_of_a_delay_make_the_whole(total_ms: float) -> None:
 def test_json_has_the_documented_keys(capsys: Capsys) -> None:
     (result,) = told(capsys, "cjb", "--no-control", "--duration", "12")
     assert tuple(result) == KEYS
-    assert result["mode"] is None
+    assert result["mode"] is None and result["mode_reason"] == "the loop was open: control was not asked for"
     assert isinstance(result["open_loop"], dict) and set(result["open_loop"]) >= {"frequency_hz", "damping_percent"}
     assert (result["scenario"], result["plant"], result["gain_mw_per_mhz"]) == ("cjb", "modal", 9.0)
     assert (result["delay_ms"], result["seed"], result["duration_s"]) == (82.0, 1, 12.0)
@@ -121,6 +124,7 @@ def test_json_has_the_documented_keys(capsys: Capsys) -> None:
     assert {"time_s", "name"} <= set(result["events"][0])
     (result,) = told(capsys, "cjb", "--duration", "1")  # over before the brake
     assert result["mode"] is None and result["open_loop"] is None
+    assert result["mode_reason"] == "too short: of the ringdown, from 6.5 s on, 4 s are needed"
 
 
 def test_a_run_is_a_function_of_plan_and_seed(tmp_path: Path) -> None:
@@ -184,6 +188,86 @@ def test_a_sweep_is_a_table(capsys: Capsys) -> None:
     ]
     assert [row.split()[:2] for row in rows] == [[str(seed), band] for seed in (1, 2, 3) for band in ("0", "0.5")]
     assert all(row.split()[-1] == "ACTIVE" and len(row) == len(head) for row in rows)
+
+
+OPEN = {
+    "disarmed before": (("--rate", "120", "--fault", "irregular"), "the loop was open: rampdown at "),
+    "no frames any more": (("--fault", "all-stop"), "the loop was open: rampdown at 10.1"),
+    "disarmed by ringing": (("--plant", "modal-five", "--gain", "40"), "the loop was open: rampdown at 7.4"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), OPEN.values(), ids=OPEN)
+def test_a_loop_that_was_open_has_no_closed_loop_mode(arguments: tuple[str, ...], said: str, capsys: Capsys) -> None:
+    (result,) = told(capsys, "cjb", *arguments, "--duration", "14")
+    assert result["mode"] is None and str(result["mode_reason"]).startswith(said)
+    assert isinstance(result["open_loop"], dict)
+    assert run(dcon(), ["simulate", "cjb", *arguments, "--duration", "14"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("  closed loop"))
+    assert line == f"  closed loop  {result['mode_reason']}"
+
+
+def test_a_sweep_shows_no_open_loop_in_a_closed_loops_place(capsys: Capsys) -> None:
+    arguments = ["simulate", "cjb", "--fault", "all-stop", "--sweep", "gain=9:10:1", "--duration", "14"]
+    assert run(dcon(), arguments) == 0
+    out, err = capsys.readouterr()
+    assert [row.split()[1:3] for row in out.splitlines()[1:]] == [["-", "-"]] * 2
+    assert err.count("the loop was open") == 2
+    assert run(dcon(), [*arguments, "--no-control"]) == 0
+    out, err = capsys.readouterr()
+    assert all(float(row.split()[1]) == pytest.approx(0.425, abs=1e-3) for row in out.splitlines()[1:]) and not err
+
+
+def test_why_a_run_is_not_judged_is_asked_of_the_whole_window() -> None:
+    plan = Plan(duration_s=14)  # its ringdown is from 6.5 s on
+    ticks = [number / 60 for number in range(14 * 60)]
+    active = [(1.0, Event("active", "system", "order"))]
+    left = [*active, (9.0, Event("rampdown", "system", "bad")), (10.0, Event("standby", "system", ""))]
+    for closed_s, events, said in (
+        ((1, 14), active, ""),
+        ((6.5, 14), active, ""),
+        ((1, 9), left, "the loop was open: rampdown at 9.000 s, bad"),
+        ((1, 5), active, "the loop was open: from 6.500 s on"),
+        ((7, 14), active, "the loop was open: it was closed from 7.000 s on only, the ringdown begins at 6.5 s"),
+        ((20, 30), [], "the loop was open: it was never armed and activated"),
+    ):
+        closed = [closed_s[0] <= at < closed_s[1] for at in ticks]
+        assert why_unjudged(plan, ticks, closed, events) == said
+    assert why_unjudged(Plan("probing"), ticks, [True] * len(ticks), []) == "the scenario has no ringdown"
+
+
+def test_quiet_is_quiet(tmp_path: Path, capsys: Capsys) -> None:
+    more: list[str]
+    for more in ([], ["--sweep", "seed=1:2:1"], ["--out", str(tmp_path)]):
+        assert run(dcon(), ["simulate", "cjb", "--duration", "1", "-q", *more]) == 0
+        assert capsys.readouterr() == ("", "")
+    assert json.loads((tmp_path / "result.json").read_text())["scenario"] == "cjb"
+
+
+PROFILE = "[stream N1]\nloss = 1%\n"
+
+
+@pytest.mark.parametrize("how", ["itself", "a symbolic link", "a hard link"])
+@pytest.mark.parametrize("sweep", [False, True], ids=["a run", "a sweep"])
+@pytest.mark.parametrize("written", ["result.json", "session"])
+def test_what_is_written_is_not_the_profile(
+    written: str, sweep: bool, how: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    name = written if written == "result.json" else "session-1.mcap" if sweep else "session.mcap"
+    out = tmp_path / "out"
+    out.mkdir()
+    profile = out / name if how == "itself" else tmp_path / "p.ini"
+    profile.write_text(PROFILE)
+    if how == "a symbolic link":
+        (out / name).symlink_to(profile)
+    elif how == "a hard link":
+        (out / name).hardlink_to(profile)
+    more = ["--sweep", "seed=1:2:1"] if sweep else []
+    arguments = ["simulate", "cjb", "--duration", "1", "--impair", str(profile), "--out", str(out), *more]
+    assert run(dcon(), arguments) == 2
+    said, said_so = capsys.readouterr().err, ("is an input, and would be", "is there already, and would be")
+    assert said.count("\n") == 1 and any(words in said for words in said_so)
+    assert profile.read_text() == PROFILE and len(list(out.iterdir())) == 1
 
 
 def test_a_single_run_leaves_its_result_beside_its_session(tmp_path: Path, capsys: Capsys) -> None:
