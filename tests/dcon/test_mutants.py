@@ -164,7 +164,11 @@ FRAMES = [
     *of(rows._longest_gap_ms, (PARAMS, 50.0), (replace(PARAMS, rate_hz=30), 100.0)),
 ]
 INSTANCES = [
-    *of(rows.alignment_age, (pair(memory(time_ns=T - 80 * MS), memory(time_ns=T - 90 * MS)), 90.0)),
+    *of(
+        rows.alignment_age,
+        (pair(memory(time_ns=T - 80 * MS), memory(time_ns=T - 90 * MS)), 90.0),
+        (pair(memory(time_ns=T - 1000 * MS), memory(time_ns=T - 80 * MS)), 1000.0),
+    ),
     *of(
         rows.alignment_skew,
         *((pair(memory(slot=a), memory(slot=b)), 5) for a, b in ((9, 4), (4, 9))),

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from support.rig import Rig, Signal, constant, steady
 
+from dcon.core.command import Command, form
 from dcon.core.params import Params
 from dcon.core.probe import IDLE, Probe, Probing, Waveform, advance, started, tones_hz, waveform
-from dcon.core.values import Event, Order, Surroundings
+from dcon.core.state import initial_state
+from dcon.core.values import Event, Mode, Order, Surroundings, SystemState
 from dcon.limiter import SLEW_MW_PER_S
 from pmutools.errors import SettingsError
 
@@ -195,3 +198,45 @@ def test_the_checks_of_the_command_do_not_see_it() -> None:
     assert max(record.probe_mw for record in rig.records) > 40  # slewed
     assert rig.records[-1].state == "ACTIVE"
     assert not rig.seen(80) & {"ringing", "growing", "saturation", "bias"}
+
+
+def formed(
+    system: SystemState = SystemState.ACTIVE,
+    mode: Mode = Mode.CLOSED_LOOP,
+    own_mw: float = 0.0,
+    probe: Probe = IDLE,
+    transfer_s: float = 1.0,
+    **probing: Any,
+) -> Command:
+    """The command of one tick after one of 0 MW of the same instance; the signal is a file's 100 MW."""
+    params = Params.paired(
+        ("N",), ("S",), transfer_s=transfer_s, probing=Probing("file", samples=(100.0,) * 600, **probing)
+    )
+    state = initial_state(params, mode=mode)._replace(system=SystemState.ACTIVE, active=0)
+    return form(params, state, system, mode, 0, own_mw, probe)
+
+
+@pytest.mark.parametrize(("ramp_s", "transfer_s", "stop_s"), [(3.0, 1.0, 1.0), (0.5, 1.0, 0.5), (1.0, 4.0, 1.0)])
+def test_a_signal_that_is_cut_short_is_gone_when_the_feedback_is(
+    ramp_s: float, transfer_s: float, stop_s: float
+) -> None:
+    """Disarmed, it comes down in the shorter of both times; stopped in ACTIVE, in its own."""
+    on = Probe(tick=100, level=1.0, mw=100.0)
+    given: dict[str, Any] = {"ramp_s": ramp_s, "transfer_s": transfer_s}
+    cut = formed(SystemState.RAMPDOWN, probe=on, **given).probe
+    assert cut.stopping and cut.level == pytest.approx(1 - 1 / (60 * stop_s))
+    stopped = formed(probe=on._replace(stopping=True), **given).probe
+    assert stopped.level == pytest.approx(1 - 1 / (60 * ramp_s))
+    assert formed(probe=on, **given).probe == on._replace(tick=101)
+
+
+def test_the_backstop_that_holds_either_of_feedback_and_sum_is_told() -> None:
+    step = SLEW_MW_PER_S / 60
+    begun = Probe(tick=0, level=1.0)
+    for own_mw, probe, slewed in ((10.0, IDLE, False), (10.0, begun, True), (5.0, begun, False), (30.0, IDLE, True)):
+        command = formed(own_mw=own_mw, probe=probe)
+        assert command.slewed is slewed, (own_mw, probe)
+        assert command.driven_mw == pytest.approx(min(own_mw + command.probe.mw, step))
+    # the signal alone is driven, and the feedback that is only computed is held
+    command = formed(mode=Mode.OPEN_LOOP, own_mw=30.0, probe=begun, open_loop=True)
+    assert command.slewed and (command.command_mw, command.driven_mw) == pytest.approx((step, 500 / 60))

@@ -246,6 +246,14 @@ def test_age_of_the_newest_common_stamp(late_ms: float, up: bool) -> None:
     assert ("alignment_age" in rig.up) is up
 
 
+@pytest.mark.parametrize("silent", ["N1", "S1"])
+def test_one_side_that_is_stale_is_enough(silent: str) -> None:
+    rig = Rig(steady(("N1", "S1")), extra="[supervisor]\ngap_ms = 1000\nalignment_skew_frames = 31").run(30)
+    rig.signals = steady(("N1", "S1"), **{silent: Signal(lost=constant(True))})  # type: ignore[arg-type]
+    up = ["alignment_age" in rig.run(1).up for _ in range(12)]
+    assert up == [False] * 7 + [True] * 5  # 71 ms and 7 frames are 188 ms
+
+
 @pytest.mark.parametrize("ms", [50.0, 50.001])
 def test_fifty_ms_to_the_nanosecond(ms: float) -> None:
     rig = Rig(steady()).run(30)

@@ -54,6 +54,11 @@ def none_if_nan(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
 
 
+def value(order: Any) -> Any:
+    """Only a gain is 0 by being ordered so."""
+    return None if order.name != "gain" and order.value == 0 else order.value
+
+
 def cell(value: Any) -> Any:
     """As a table has it: what is not known, or not said, is null."""
     return none_if_nan(value) if isinstance(value, float) else None if value == "" else value
@@ -183,7 +188,7 @@ def test_event_rows(session: Path, tmp_path: Path) -> None:
     expected = []
     for tick in TICKS:
         at = tick.record.tick_ns
-        expected += [(at, "order", order.name, None, None, none_if_nan(order.value)) for order in tick.orders]
+        expected += [(at, "order", order.name, None, None, none_if_nan(value(order))) for order in tick.orders]
         expected += [(at, "event", e.name, e.subject, e.detail, None) for e in tick.record.events]
     rows = pq.read_table(tmp_path / "e.parquet").to_pylist()
     assert bits(tuple(tuple(row.values()) for row in rows)) == bits(tuple(expected))
@@ -203,7 +208,7 @@ def test_flag_rows_are_the_changes_of_the_register(session: Path, tmp_path: Path
 
 def test_messages_as_they_are(session: Path, tmp_path: Path) -> None:
     for table, values in (
-        ("setting", [(t.record.tick_ns, *map(cell, o)) for t in TICKS for o in t.orders]),
+        ("setting", [(t.record.tick_ns, *map(cell, o._replace(value=value(o)))) for t in TICKS for o in t.orders]),
         ("timing", [(t.record.tick_ns, *map(none_if_nan, t.timing)) for t in TICKS if t.timing]),
         (
             "pdci",

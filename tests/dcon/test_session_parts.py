@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -136,15 +137,6 @@ def in_parts(tmp_path: Path, *absent: int) -> tuple[Path, list[str]]:
     there = [path for path in log.parts if path.exists()]
     assert len(log.parts) == 5
     return log.parts[0], list(map(str, there))
-
-
-@pytest.mark.parametrize("named", [False, True], ids=["the first", "all"])
-@pytest.mark.parametrize("command", ["export", "analyze", "replay"])
-def test_every_command_says_which_part_is_missing(command: str, named: bool, tmp_path: Path, capsys: Capsys) -> None:
-    first, there = in_parts(tmp_path, 2, 3)
-    out = {"export": [str(tmp_path / "t.csv")], "analyze": ["--out", str(tmp_path / "a")], "replay": []}[command]
-    assert run(dcon(), [command, *(there if named else [str(first)]), *out]) == 3
-    assert "parts 2 to 3 are missing, part 4 is there" in capsys.readouterr().err
 
 
 def test_an_analysis_refuses_a_part_named_twice(tmp_path: Path, capsys: Capsys) -> None:
@@ -286,6 +278,7 @@ def test_replay_and_export_take_a_session_in_parts(session: list[Path], tmp_path
             "gaps": 0,
             "damage": [],
             "newer": None,
+            "missing": [],
         }
     export(tmp_path / "whole.mcap", tmp_path / "whole.csv")
     assert [line.split(",")[:7] for line in (tmp_path / "t.csv").read_text().splitlines()] == [
@@ -305,3 +298,20 @@ def test_a_replay_stops_where_a_part_is_missing(session: list[Path], capsys: Cap
     assert run(dcon(), ["replay", str(session[0]), str(session[3])]) == 3
     out, err = capsys.readouterr()
     assert out == "121 ticks: identical\n" and "stopped: the log lost something before tick" in err
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["the first", "all"])
+@pytest.mark.parametrize("command", ["export", "analyze", "replay"])
+def test_every_command_says_which_part_is_missing(
+    command: str, named: bool, session: list[Path], tmp_path: Path, capsys: Capsys
+) -> None:
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    there = [shutil.copy(path, kept / path.name) for path in (session[0], *session[2:])]
+    first, out = there[0], tmp_path / "out"
+    where = {"export": [str(out) + ".csv"], "analyze": ["--out", str(out)], "replay": []}[command]
+    assert run(dcon(), [command, *map(str, there if named else [first]), *where]) == 3
+    assert "part 2 is missing, part 3 is there" in capsys.readouterr().err
+    if command == "analyze":
+        (analysed,) = json.loads((out / "analysis.json").read_text())["sessions"]
+        assert any("part 2 is missing" in note for note in analysed["notes"])

@@ -183,7 +183,7 @@ def test_orders_are_among_the_inputs(session: Path, tmp_path: Path, capsys: Caps
 
     code, out, _ = told(capsys, str(rewritten(session, tmp_path / "x.mcap", edit)))
     assert code == 3 and "state <SystemState.ACTIVE: 'ACTIVE'> -> <SystemState.ESTOP: 'ESTOP'>" in out
-    assert out.endswith("  order: gain 3\n  order: estop 0\n")
+    assert out.endswith("  order: gain 3\n  order: estop\n")
 
 
 def test_other_bytes_of_the_same_values_are_no_difference(session: Path, tmp_path: Path, capsys: Capsys) -> None:
@@ -240,12 +240,47 @@ def test_a_change_of_the_probing_signal_is_seen(tmp_path: Path, capsys: Capsys) 
     [
         ("controller.gain=6", "--set: [controller] gain: unknown key"),
         ("controller.gain_mw_per_mhz=60", "--set: [controller] gain_mw_per_mhz: 60 MW/mHz is above"),
+        ("controller.gain_mw_per_mhz=60", "may set controller.gain_max_mw_per_mhz too"),
         ("gain=6", "--set: 'gain=6' is not SECTION.KEY=VALUE"),
     ],
 )
 def test_a_change_that_cannot_be(change: str, said: str, session: Path, capsys: Capsys) -> None:
     code, _, err = told(capsys, str(session), "--set", change)
     assert code == 2 and said in err and err.count("\n") == 1
+
+
+def test_a_gain_beyond_the_operators_needs_its_maximum_too(session: Path, capsys: Capsys) -> None:
+    changes = ("--set", "controller.gain_mw_per_mhz=60", "--set", "controller.gain_max_mw_per_mhz=60")
+    code, out, _ = told(capsys, str(session), *changes[2:], *changes[:2])
+    assert code == 0 and "commands differ by up to" in out
+
+
+def test_a_duration_is_of_the_session(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    table = tmp_path / "t.csv"
+    for seconds, ticks in (("2", 120), ("0.001", 1), ("1e3", 360)):
+        code, out, err = told(capsys, str(session), "--duration", seconds, "--out", str(table))
+        assert (code, out, err) == (0, f"{ticks} ticks: identical\n", "")
+        assert len(table.read_text().splitlines()) == ticks + 1
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(session.read_bytes()[:-5000])
+    assert told(capsys, str(cut), "--duration", "2")[0] == 0  # what is behind is not asked for
+    assert told(capsys, str(cut))[0] == 3
+    assert told(capsys, str(session), "--duration", "0")[0] == 2
+
+
+@pytest.mark.parametrize("how", ["itself", "a link", "a hard link"])
+def test_an_output_is_no_probing_signal_that_is_read(how: str, session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    signal, out = tmp_path / "p.csv", tmp_path / ("p.csv" if how == "itself" else "o.csv")
+    signal.write_text("probe_mw\n1.5\n-2\n")
+    if how == "a link":
+        out.symlink_to(signal)
+    elif how == "a hard link":
+        out.hardlink_to(signal)
+    changes = ("--set", "probing.kind=file", "--set", f"probing.file = {signal}")
+    code, _, err = told(capsys, str(session), *changes, "--out", str(out))
+    assert code == 2 and "is an input, and would be overwritten" in err
+    assert signal.read_text() == "probe_mw\n1.5\n-2\n"
+    assert told(capsys, str(session), *changes, "--out", str(tmp_path / "other.csv"))[0] == 0
 
 
 def test_a_cut_log_replays_to_the_cut_and_says_so(session: Path, tmp_path: Path, capsys: Capsys) -> None:

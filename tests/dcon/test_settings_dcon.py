@@ -248,7 +248,7 @@ MISTAKES = {
     "a rate that the filter cannot have": (
         "rate = 60",
         "rate = 5",
-        "dcon.ini:2: [DEFAULT] rate: 5 is out of range; it must be 6 to 240",
+        "dcon.ini:2: [DEFAULT] rate: 5 is not one of 30, 50, 60, 100, 120 frames/s",
     ),
     "a pair of unknown PMUs": (
         "align = true",
@@ -416,6 +416,29 @@ CLASHES = {
         "kind=multisine\nperiod_s=5",
         "period_s: low_hz = 0.1: no whole cycle in",
     ),
+    "no voltage is right below nominal": ("supervisor", "voltage_min_pu=1", "voltage_min_pu: 1: must be below 1, or"),
+    "no voltage is right above nominal": ("supervisor", "voltage_max_pu=1", "voltage_max_pu: 1: must be above 1, or"),
+    "a share that cannot be": (
+        "supervisor",
+        "saturation_max_percent=100",
+        "saturation_max_percent: 100: must be below 100",
+    ),
+    "ringing where the mode is": ("supervisor", "ringing_low_hz=1", "ringing_low_hz: 1: must be above 1 Hz, the band"),
+    "a phase of a whole tick": (
+        "platform",
+        "phase_ms=16.7",
+        "phase_ms: 16.7: must be below the 16.7 ms from tick to tick",
+    ),
+    "ticks as short as the phase": (
+        "controller",
+        "tick_hz=250\n[platform]\nphase_ms=4",
+        "phase_ms: 4: must be below the 4.0 ms from tick to tick",
+    ),
+    "a period that does not come whole": (
+        "probing",
+        "kind=multisine\nduration_s=39",
+        "duration_s: period_s = 40: above duration_s = 39",
+    ),
     "ramps longer than the signal": (
         "probing",
         "kind=chirp\nduration_s=1",
@@ -553,14 +576,14 @@ def test_check_prints_every_setting_with_unit_default_and_source(
         "[pmu S1] url = tcp://192.0.2.21:4712   (initialisation file)",
         "[pmu S1] idcode = 201   (initialisation file; default not set)",
         "[pmu S1] station = SOUTH ONE   (initialisation file; default not set)",
-        "[pmu S1] voltage = VA,VB,VC   (own choice)",
+        "[pmu S1] voltage = VA,VB,VC   (initialisation file)",
         "[pmu N2] voltage = V1LPM   (initialisation file; default VA,VB,VC)",
-        "[pmu N2] rate = 60 frames/s   (section III)",
+        "[pmu N2] rate = 60 frames/s   (initialisation file)",
         "[pmu X] nominal_kv = 230 kV   (initialisation file; default not set)",
         "[controller] gain_mw_per_mhz = 12 MW/mHz   (initialisation file; default 9 MW/mHz)",
         "[controller] deadband_mhz = 0 mHz   (initialisation file; default 0.25 mHz)",
         "[controller] limit_mw = 125 MW   (section I)",
-        "[controller] align = true   (section V.C)",
+        "[controller] align = true   (initialisation file)",
         "[controller] priority = N1-S1,N1-S2,N2-S1,N2-S2   (own choice)",
         "[supervisor] gap_ms = 60 ms   (initialisation file; default 50 ms)",
         "[platform] phase_ms = 4.5 ms   (initialisation file; default 4 ms)",
@@ -593,6 +616,102 @@ def test_every_setting_says_where_it_comes_from_and_every_number_its_unit() -> N
     (ramp,) = (row for row in effective(parse(PAIR, "dcon.ini")) if row.key == "gain_ramp_per_s")
     assert ramp.source == "own choice"
     assert (gain.value, gain.default) == ("9 MW/mHz", None) and gain.source.startswith("section VI")
+
+
+def test_a_default_that_is_written_out_comes_from_the_file() -> None:
+    text = f"{PAIR}[controller]\nInit_S = 20\npriority = N1-S1\n[supervisor]\ngap_ms = 50\n[log]\nmax_mb = 1000\n"
+    rows = {(row.section, row.key): row for row in effective(parse(text, "dcon.ini", ("platform.fifo=true",)))}
+    given = {place for place, row in rows.items() if row.source == "initialisation file"}
+    keys = {("controller", "init_s"), ("controller", "priority"), ("supervisor", "gap_ms"), ("log", "max_mb")}
+    named = {(f"pmu {name}", key) for name in ("N1", "S1") for key in ("url", "side")}
+    assert given == keys | named | {("platform", "fifo")}
+    assert all(rows[place].default is None for place in keys)
+
+
+@pytest.mark.parametrize(
+    ("keys", "idle"),
+    [
+        ("limit_mw = 20", ["growing", "bias", "the limit of arming"]),
+        ("limit_mw = 0", ["growing", "bias", "saturation", "the limit of arming"]),
+        ("limit_mw = 20\narm_limit_mw = 19\n[supervisor]\ngrowth_min_mw = 5\nbias_max_mw = 19", []),
+        ("limit_mw = 62.5", ["the limit of arming"]),
+        ("limit_mw = 62.6", []),
+        ("limit_mw = 100\n[supervisor]\nbias_max_mw = 100", ["bias"]),
+        ("limit_mw = 100\n[supervisor]\nbias_max_mw = 99.9", []),
+        ("", []),
+    ],
+)
+def test_a_check_that_cannot_fire_is_a_warning(
+    keys: str, idle: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "dcon.ini"
+    path.write_text(f"{PAIR}[controller]\n{keys}\n")
+    assert run(dcon(), ["check", "--ini", str(path), "--json"]) == 0
+    out, err = capsys.readouterr()
+    warnings = json.loads(out)["warnings"]
+    assert [warning.partition(" can never fire at limit_mw = ")[0] for warning in warnings] == idle
+    assert err == "".join(f"warning: {warning}\n" for warning in warnings)
+    assert run(dcon(), ["check", "--ini", str(path)]) == 0
+    assert capsys.readouterr().err == err
+
+
+@pytest.mark.parametrize("how", ["by name", "by a link", "by a hard link"])
+@pytest.mark.parametrize("key", ["[log]\npath", "[watchdog]\nlog"])
+@pytest.mark.parametrize(
+    ("what", "name"), [("initialisation file", "dcon.ini"), ("probing signal", "p.csv"), ("file of keys", "k")]
+)
+def test_a_log_is_not_a_file_that_is_read(
+    what: str, name: str, key: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read, ini = tmp_path / name, tmp_path / "dcon.ini"
+    log = read if how == "by name" else tmp_path / "log"
+    for file in (ini, tmp_path / "p.csv", tmp_path / "k"):
+        file.write_text("probe_mw\n1\n")
+    if how == "by a link":
+        log.symlink_to(read)
+    elif how == "by a hard link":
+        log.hardlink_to(read)
+    text = f"{PAIR}[probing]\nkind = file\nfile = {tmp_path}/p.csv\n[server]\nkeys = {tmp_path}/k\n"
+    ini.write_text(f"{text}{key} = {log}\n")
+    assert run(dcon(), ["check", "--ini", str(ini)]) == 2
+    said = capsys.readouterr().err
+    section, _, entry = key.partition("\n")
+    assert said.startswith(f"dcon: {ini}:13: {section} {entry}: {log} is the {what}, and would be overwritten")
+    ini.write_text(f"{text}{key} = {tmp_path}/new\n")
+    assert run(dcon(), ["check", "--ini", str(ini)]) == 0
+
+
+def test_the_default_log_may_be_the_file_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("session.mcap").write_text(PAIR)
+    assert run(dcon(), ["check", "--ini", "session.mcap"]) == 2
+    assert "[log] path: session.mcap is the initialisation file" in capsys.readouterr().err
+
+
+def test_a_probing_file_that_is_set_goes_over_the_recorded_one(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text("probe_mw\n3\n4\n")
+    text, recorded = f"{PAIR}[probing]\nkind = file\nfile = gone.csv\n", b"probe_mw\n1\n"
+    assert parse(text, "log", probe_file=recorded).params.probing.samples == (1.0,)
+    assert parse(text, "log", ("probing.amplitude_mw=5",), probe_file=recorded).params.probing.samples == (1.0,)
+    changed = parse(text, "log", (f"probing.file={path}",), probe_file=recorded)
+    assert changed.params.probing.samples == (3.0, 4.0) and changed.probe_file == path.read_bytes()
+
+
+@pytest.mark.parametrize("rate", [10, 25, 59, 61, 240])
+def test_rates_that_the_filter_is_not_made_for(rate: int) -> None:
+    with pytest.raises(SettingsError, match="is not one of 30, 50, 60, 100, 120 frames/s"):
+        parse(GOOD.replace("rate = 60", f"rate = {rate}"), "dcon.ini")
+    with pytest.raises(SettingsError, match=r"^rate_hz = "):
+        Params.paired(("N",), ("S",), rate_hz=rate)
+
+
+@pytest.mark.parametrize("seconds", ["0", "0.09"])
+def test_an_instance_takes_time_to_be_ready(seconds: str) -> None:
+    with pytest.raises(SettingsError, match=r"init_s: .* out of range; it must be 0\.1 to 3600"):
+        parse(f"{PAIR}[controller]\ninit_s = {seconds}\n", "dcon.ini")
 
 
 def test_a_priority_of_ones_own() -> None:
