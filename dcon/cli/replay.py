@@ -70,6 +70,8 @@ def command(
     talk.progress("")
     if as_json:
         click.echo(json.dumps(result.to_json()))
+    elif quiet:
+        pass
     elif changes:
         click.echo(
             f"{result.ticks} ticks with {', '.join(changes)}: commands differ by up to "

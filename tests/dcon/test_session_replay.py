@@ -255,6 +255,12 @@ def test_a_gain_beyond_the_operators_needs_its_maximum_too(session: Path, capsys
     assert code == 0 and "commands differ by up to" in out
 
 
+def test_quiet_says_it_by_the_exit_code(session: Path, tmp_path: Path, capsys: Capsys) -> None:
+    assert told(capsys, str(session), "--quiet") == (0, "", "")
+    changed = rewritten(session, tmp_path / "x.mcap", record_changed(command_mw=1.0))
+    assert told(capsys, str(changed), "--quiet") == (3, "", "")
+
+
 def test_a_duration_is_of_the_session(session: Path, tmp_path: Path, capsys: Capsys) -> None:
     table = tmp_path / "t.csv"
     for seconds, ticks in (("2", 120), ("0.001", 1), ("1e3", 360)):
