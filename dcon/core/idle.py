@@ -18,7 +18,7 @@ def idle_checks(params: Params) -> list[str]:
     found = (
         (
             "growing",
-            f"growth_min_mw = {limits.growth_min_mw:g}: a swing must come to {grown_mw:g} MW",
+            f"growth_min_mw = {limits.growth_min_mw:g}, so a swing must come to {grown_mw:g} MW",
             grown_mw >= SQUARE * limit_mw,
         ),
         ("bias", f"bias_max_mw = {limits.bias_max_mw:g}", limits.bias_max_mw >= limit_mw),

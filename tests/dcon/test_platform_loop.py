@@ -174,7 +174,8 @@ def test_arrivals_stamped_by_a_wrong_clock_are_not_kept_for_ever(bench: Make) ->
 
 def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
-    news = [
+    news = [LinkEvent(LinkKind.NOTHING, "udp://127.0.0.1:4802", (1,), "nothing has come; is the sender on?")]
+    news += [
         LinkEvent(LinkKind.FOREIGN, f"udp://192.0.2.9:{port}", (0,), f"IDCODE {port} comes from there")
         for port in range(1, 200)
     ]
@@ -184,5 +185,6 @@ def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pyte
     summary = made.run(1)
     assert summary.own_drops == 7
     told = [entry.getMessage() for entry in caplog.records]
-    assert told[0] == "udp://192.0.2.9:1: foreign IDCODE 1 comes from there"
-    assert len(told) == TOLD + 1 and told[-1] == "udp://127.0.0.1:4801: own-drops buffer full"
+    assert told[0] == "udp://127.0.0.1:4802: nothing has come; is the sender on?"
+    assert told[1] == "udp://192.0.2.9:1: foreign IDCODE 1 comes from there"
+    assert len(told) == TOLD + 2 and told[-1] == "udp://127.0.0.1:4801: own-drops buffer full"
