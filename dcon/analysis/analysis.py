@@ -19,6 +19,7 @@ from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
 from dcon.session.column_tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
 from dcon.session.columns import read_columns
+from dcon.session.newer import Newer
 from dcon.session.parts import Part, named_twice, part_of
 from dcon.settings import parse
 from pmutools.errors import SettingsError, SourceError

@@ -33,8 +33,7 @@ def command(sessions: tuple[str, ...], out: Path, as_json: bool, quiet: bool, ve
     outcome = write_analysis(sessions, out, lambda name: talk.progress(f"reading {name}"))
     talk.progress("")
     if as_json:
-        said = [{"files": files, **(found.to_json() or {})} for files, found in newer]
-        click.echo(json.dumps(outcome.to_json() | {"newer": said}, allow_nan=False))
+        click.echo(json.dumps(outcome.to_json(), allow_nan=False))
     elif not quiet:
         for sentence in main_findings(outcome):
             click.echo(sentence)
