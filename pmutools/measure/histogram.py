@@ -39,7 +39,7 @@ _PAGE = 1 << _PAGE_BITS
 _NARROW = np.iinfo(np.uint32).max
 _DENSE = 1 << 14
 """A batch that spans more bins is sorted rather than counted in an array."""
-_FEW = 16
+_FEW = 48
 """Fewer bins of a page than so many are kept one by one, 16 bytes each."""
 _LOOKED_FROM = 128
 """So many bins kept one by one are looked through for pages that have become worth it."""
@@ -133,21 +133,30 @@ class Histogram:
 
     def _count(self, number: int, bins: Ints, counts: Ints) -> None:
         """Add to bins (B,) of a page, on the page or, where there is none and B is small, one by one."""
-        first = number << _PAGE_BITS
-        if (page := self._pages.get(number)) is None:
-            if len(bins) < _FEW:
-                for at, count in zip(bins.tolist(), counts.tolist(), strict=True):
-                    self._count_one(first + at, count)
-                if len(self._few) > self._few_most:
-                    self._open_pages()
-                return
-            page = self._pages[number] = np.zeros(_PAGE, self._type)
-            start, end = (bisect_left(self._few, edge) for edge in (first, first + _PAGE))
-            page[np.array(self._few[start:end], np.int64) - first] = self._few_counts[start:end]
-            del self._few[start:end], self._few_counts[start:end]
+        if number not in self._pages and len(bins) < _FEW:
+            first = number << _PAGE_BITS
+            for at, count in zip(bins.tolist(), counts.tolist(), strict=True):
+                self._count_one(first + at, count)
+            if len(self._few) > self._few_most:
+                self._open_pages()
+            return
+        page = self._pages[number] if number in self._pages else self._open(number)
         page[bins] += counts.astype(self._type)
 
+    def _open(self, number: int) -> npt.NDArray[Any]:
+        """A new page, with what was kept one by one of it."""
+        page = self._pages[number] = np.zeros(_PAGE, self._type)
+        first = number << _PAGE_BITS
+        start, end = (bisect_left(self._few, edge) for edge in (first, first + _PAGE))
+        if start < end:
+            page[np.array(self._few[start:end], np.int64) - first] = self._few_counts[start:end]
+            del self._few[start:end], self._few_counts[start:end]
+        return page
+
     def _count_one(self, index: int, count: int) -> None:
+        if (page := self._pages.get(index >> _PAGE_BITS)) is not None:
+            page[index & _PAGE - 1] += count
+            return
         place = bisect_left(self._few, index)
         if place < len(self._few) and self._few[place] == index:
             self._few_counts[place] += count
@@ -185,8 +194,19 @@ class Histogram:
         """Add all that ``other`` counted."""
         if other.min_ns is None or other.max_ns is None:
             return
+        first = not self.count
         self._combine(other.count, other._mean, other._m2, other.min_ns, other.max_ns)
-        self._count_all(*other._found())
+        if first:
+            self._pages = {number: page.astype(self._type) for number, page in other._pages.items()}
+            self._few, self._few_counts, self._few_most = other._few[:], other._few_counts[:], other._few_most
+            return
+        for number, page in other._pages.items():
+            mine = self._pages[number] if number in self._pages else self._open(number)
+            mine += page.astype(self._type)
+        for index, count in zip(other._few, other._few_counts, strict=True):
+            self._count_one(index, count)
+        if len(self._few) > self._few_most:
+            self._open_pages()
 
     def __eq__(self, other: object) -> bool:
         """Whether both counted the same in every bin; means may differ in their last bits."""

@@ -93,13 +93,13 @@ def test_memory_does_not_grow_with_wild_values() -> None:
 
 
 def test_bins_far_from_most_are_kept_one_by_one_until_they_are_many() -> None:
-    usual, stalls = np.arange(16_000_000, 16_200_000, 1000), np.arange(300_000_000, 500_000_000, 4_000_000)
+    usual, stalls = np.arange(16_384_000, 20_480_000, 8000), np.arange(300_000_000, 500_000_000, 4_000_000)
     histogram = Histogram(usual)
     for stall in stalls.tolist():
-        histogram.add(np.array([16_000_000, stall]))
+        histogram.add(np.array([16_384_000, stall]))
     opened = len(histogram._pages)
     assert len(histogram._few) == len(stalls)
-    assert histogram == Histogram([*usual.tolist(), *stalls.tolist(), *[16_000_000] * len(stalls)])
+    assert histogram == Histogram([*usual.tolist(), *stalls.tolist(), *[16_384_000] * len(stalls)])
     for near in range(300_000_000, 400_000_000, 300_000):
         histogram.add(np.array([near]))
     assert len(histogram._pages) > opened
