@@ -286,7 +286,7 @@ KEYS = {
 }
 LIVELY = [
     frame._replace(
-        v1=frame.v1 * (1 + 1e-3 * math.sin(k)),
+        v1=frame.v1 * (1.01 + 1e-3 * math.sin(k)),
         v2=frame.v1 * 0.01 * math.sin(k + 1),
         frequency_hz=frame.frequency_hz + 1e-3 * math.sin(3 * k),
         arrival_ns=frame.arrival_ns + round(1e6 * math.sin(k)),
