@@ -161,10 +161,27 @@ class Captured:
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Captured:
+    """A capture that tells the packets apart. On two processors two may have one stamp, or be written out of order, of
+    which tshark makes nothing: then they are played again.
+    """
+    for _ in range(2):
+        try:
+            taken = capture(tmp_path_factory.mktemp("peers"))
+        except OneStampTwice:
+            continue
+        if all(taken.of(run, transport) for run in taken.runs.values() for transport in (*SPONTANEOUS, *COMMANDED)):
+            return taken
+    return capture(tmp_path_factory.mktemp("peers"))
+
+
+class OneStampTwice(Exception):
+    """Two packets of different ports have the same stamp."""
+
+
+def capture(folder: Path) -> Captured:
     """All recordings are played at once, while tshark captures the ports that they use, and no others."""
     import pyarrow.parquet as pq
 
-    folder = tmp_path_factory.mktemp("peers")
     names = [name for name, path in RECORDINGS.items() if path.exists()]
     free = free_ports(7 * len(names))
     runs = {name: Playing(name, folder / f"{name}.parquet", free[7 * n : 7 * n + 7]) for n, name in enumerate(names)}
@@ -226,7 +243,8 @@ def ports_of(pcapng: Path, ours: set[int]) -> dict[int, Port]:
         packet = body[20 : 20 + length]
         ends = struct.unpack_from(">HH", packet, 14 + 4 * (packet[14] & 15))
         port = PROTOCOLS[packet[23]], next(port for port in reversed(ends) if port in ours)
-        assert found.setdefault((high << 32 | low) * tick_ns, port) == port, "two packets at one time"
+        if found.setdefault((high << 32 | low) * tick_ns, port) != port:
+            raise OneStampTwice
     return found
 
 
