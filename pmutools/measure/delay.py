@@ -42,7 +42,6 @@ RESOLUTIONS_NS = (1_000, 1_000_000, 10_000_000)
 class DelayCounts(Counts):
     """Delays of unique frames whose arrival is known."""
 
-    delay: Histogram = field(default_factory=Histogram)
     locked: Histogram = field(default_factory=Histogram)
     """Of frames that say they are synchronised."""
     unlocked: Histogram = field(default_factory=Histogram)
@@ -65,6 +64,16 @@ class DelayCounts(Counts):
     """How many arrivals are whole multiples of each of :data:`RESOLUTIONS_NS`."""
     jitter_ns: float = field(default=0.0, metadata={"merge": lambda mine, later: later or mine})
     """RFC 3550's, at the last frame."""
+
+    @property
+    def delay(self) -> Histogram:
+        """Of all. Not kept beside the two that it is made of: most streams have but one of them."""
+        if not self.unlocked.count:
+            return self.locked
+        found = Histogram()
+        found.merge(self.locked)
+        found.merge(self.unlocked)
+        return found
 
     @property
     def correlation(self) -> float | None:
@@ -120,7 +129,6 @@ class DelayMeter:
         if not len(frames):
             return
         arrival, delay = frames.arrival_ns, frames.delay_ns
-        counts.delay.add(delay)
         if frames.synchronised.all():
             counts.locked.add(delay)
         else:

@@ -36,11 +36,12 @@ PERCENTILES = {
 """Those that every distribution is told by, by the key they have in ``summary.json``."""
 _PAGE_BITS = 8
 _PAGE = 1 << _PAGE_BITS
-_NARROW = np.iinfo(np.uint32).max
+_TYPES = {np.dtype(kind): int(np.iinfo(kind).max) for kind in (np.uint8, np.uint16, np.uint32, np.int64)}
+"""What a page may be of, from narrow to wide, and how much each counts: the tail's many pages hold little."""
 _DENSE = 1 << 14
 """A batch that spans more bins is sorted rather than counted in an array."""
 _FEW = 48
-"""Fewer bins of a page than so many are kept one by one, 16 bytes each."""
+"""Fewer bins of a page than so many are kept one by one, 12 bytes each."""
 _LOOKED_FROM = 128
 """So many bins kept one by one are looked through for pages that have become worth it."""
 
@@ -76,7 +77,7 @@ class Histogram:
         "_m2",
         "_mean",
         "_pages",
-        "_type",
+        "_totals",
         "count",
         "max_ns",
         "min_ns",
@@ -88,10 +89,11 @@ class Histogram:
         self.max_ns: int | None = None
         self._mean, self._m2 = 0.0, 0.0
         self._pages: dict[int, npt.NDArray[Any]] = {}
-        self._few, self._few_counts = array("q"), array("q")
+        self._totals: dict[int, int] = {}
+        """How much a page has counted."""
+        self._few, self._few_counts = array("i"), array("q")
         """Bins far from most, in order: a stall that delays a frame of each of many streams must not open pages."""
         self._few_most = _LOOKED_FROM
-        self._type: type[np.integer[Any]] = np.uint32
         self._kept: tuple[Ints, Ints, Ints] | None = None
         """What :meth:`_filled` found since the last value came, and the sums of its counts."""
         self.add(np.asarray(values_ns, np.int64))
@@ -112,10 +114,13 @@ class Histogram:
             base = first & -_PAGE
             counts = np.bincount(indices - base, minlength=(last | _PAGE - 1) + 1 - base)
             pages = counts.reshape(-1, _PAGE)
-            for at in np.flatnonzero(pages.any(1)).tolist():
+            for at, total in enumerate(pages.sum(1).tolist()):
                 number = (base >> _PAGE_BITS) + at
-                if (page := self._pages.get(number)) is not None:
-                    page += pages[at].astype(self._type)
+                if not total:
+                    continue
+                if number in self._pages:
+                    page = self._page(number, total)
+                    page += pages[at].astype(page.dtype)
                 else:
                     bins = np.flatnonzero(pages[at])
                     self._count(number, bins, pages[at][bins])
@@ -140,22 +145,30 @@ class Histogram:
             if len(self._few) > self._few_most:
                 self._open_pages()
             return
-        page = self._pages[number] if number in self._pages else self._open(number)
-        page[bins] += counts.astype(self._type)
+        page = self._page(number, int(counts.sum()))
+        page[bins] += counts.astype(page.dtype)
 
-    def _open(self, number: int) -> npt.NDArray[Any]:
-        """A new page, with what was kept one by one of it."""
-        page = self._pages[number] = np.zeros(_PAGE, self._type)
+    def _page(self, number: int, more: int) -> npt.NDArray[Any]:
+        """The page to count ``more`` on: a new one has what was kept one by one of it."""
+        page = self._pages.get(number)
         first = number << _PAGE_BITS
-        start, end = (bisect_left(self._few, edge) for edge in (first, first + _PAGE))
-        if start < end:
-            page[np.array(self._few[start:end], np.int64) - first] = self._few_counts[start:end]
+        if page is None:
+            start, end = (bisect_left(self._few, edge) for edge in (first, first + _PAGE))
+            indices, counts = self._few[start:end], self._few_counts[start:end]
             del self._few[start:end], self._few_counts[start:end]
+            total = self._totals[number] = sum(counts) + more
+            page = self._pages[number] = np.zeros(_PAGE, _wide_enough(total))
+            page[np.array(indices, np.int64) - first] = counts
+            return page
+        total = self._totals[number] = self._totals[number] + more
+        if total > _TYPES[page.dtype]:
+            page = self._pages[number] = page.astype(_wide_enough(total))
         return page
 
     def _count_one(self, index: int, count: int) -> None:
-        if (page := self._pages.get(index >> _PAGE_BITS)) is not None:
-            page[index & _PAGE - 1] += count
+        number = index >> _PAGE_BITS
+        if number in self._pages:
+            self._page(number, count)[index & _PAGE - 1] += count
             return
         place = bisect_left(self._few, index)
         if place < len(self._few) and self._few[place] == index:
@@ -169,7 +182,10 @@ class Histogram:
         indices, counts = self._kept_singly()
         numbers, sizes = np.unique(indices >> _PAGE_BITS, return_counts=True)
         many = np.isin(indices >> _PAGE_BITS, numbers[sizes >= _FEW])
-        self._few, self._few_counts = (array("q", column[~many].tolist()) for column in (indices, counts))
+        self._few, self._few_counts = (
+            array(kept.typecode, column[~many].tolist())
+            for kept, column in ((self._few, indices), (self._few_counts, counts))
+        )
         self._count_all(indices[many], counts[many])
         self._few_most = _LOOKED_FROM + 2 * len(self._few)
 
@@ -186,9 +202,6 @@ class Histogram:
         self.min_ns = low if self.min_ns is None else min(self.min_ns, low)
         self.max_ns = high if self.max_ns is None else max(self.max_ns, high)
         self.count = total
-        if total > _NARROW and self._type is np.uint32:  # half the memory, until then
-            self._type = np.int64
-            self._pages = {number: page.astype(np.int64) for number, page in self._pages.items()}
 
     def merge(self, other: Histogram) -> None:
         """Add all that ``other`` counted."""
@@ -197,12 +210,13 @@ class Histogram:
         first = not self.count
         self._combine(other.count, other._mean, other._m2, other.min_ns, other.max_ns)
         if first:
-            self._pages = {number: page.astype(self._type) for number, page in other._pages.items()}
+            self._pages = {number: page.copy() for number, page in other._pages.items()}
+            self._totals = dict(other._totals)
             self._few, self._few_counts, self._few_most = other._few[:], other._few_counts[:], other._few_most
             return
         for number, page in other._pages.items():
-            mine = self._pages[number] if number in self._pages else self._open(number)
-            mine += page.astype(self._type)
+            mine = self._page(number, other._totals[number])
+            mine += page.astype(mine.dtype)
         for index, count in zip(other._few, other._few_counts, strict=True):
             self._count_one(index, count)
         if len(self._few) > self._few_most:
@@ -323,6 +337,10 @@ class Histogram:
     def to_json(self) -> dict[str, Any]:
         """All of it: the bins as [low ms, high ms, count]."""
         return {"count": self.count, "bins": [[low / NS_PER_MS, high / NS_PER_MS, n] for low, high, n in self.bins()]}
+
+
+def _wide_enough(total: int) -> np.dtype[Any]:
+    return next(kind for kind, most in _TYPES.items() if total <= most)
 
 
 def ms(value_ns: float | None) -> float | None:

@@ -134,6 +134,30 @@ def test_more_than_32_bits_can_count() -> None:
     assert small.quantile_ns(0.5) == pytest.approx(5_000_000, abs=error_ns(5_000_000))
 
 
+@given(st.lists(st.tuples(st.integers(0, 300), st.integers(1, 30_000)), min_size=1, max_size=12))
+def test_pages_grow_wider_as_they_fill(batches: list[tuple[int, int]]) -> None:
+    spread = np.arange(300) * 1000
+    histogram, expected = Histogram(spread), np.ones(301, np.int64)
+    expected[300] = 0
+    for bin_us, times in batches:
+        histogram.add(np.full(times, bin_us * 1000))
+        expected[bin_us] += times
+    assert [count for *_, count in histogram.bins()] == expected[expected > 0].tolist()
+    twice = deepcopy(histogram)
+    twice.merge(histogram)
+    assert [count for *_, count in twice.bins()] == (2 * expected[expected > 0]).tolist()
+
+
+def test_a_page_that_holds_little_is_small() -> None:
+    kinds = []
+    for times in (100, 10_000, 100_000):
+        histogram = Histogram(np.arange(200) * 1000)
+        histogram.add(np.full(times, 5000))
+        kinds.append(histogram._pages[0].itemsize)
+    assert kinds == [2, 2, 4]
+    assert Histogram(np.arange(200) * 1000)._pages[0].itemsize == 1
+
+
 def test_edges_of_many_bins_are_those_of_each() -> None:
     values = np.concatenate((np.arange(-3000, 3000) * 1000, np.logspace(6, 17, 500).astype(np.int64)))
     values = np.concatenate((values, -values))
