@@ -104,6 +104,16 @@ def _may_lock_memory() -> bool:
     return bool(masks and masks[0] >> cap_ipc_lock & 1)
 
 
+def trim_heap() -> None:
+    """Give back to the system what lies free within the C library's heap; it takes milliseconds.
+
+    A burst of work raises the heap's top, and what is allocated there and kept holds all below it in memory, used or
+    not. Does nothing where the C library (musl) has no such call.
+    """
+    if libc is not None and (trim := getattr(libc, "malloc_trim", None)) is not None:
+        trim(ctypes.c_size_t(0))
+
+
 def end_with_parent(number: int) -> str | None:
     """Have the kernel send this process signal ``number`` when its parent's thread ends. None, or why not."""
     if libc is None:

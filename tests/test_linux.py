@@ -53,6 +53,20 @@ def test_timer_slack_fifo_and_lock_either_work_or_say_why() -> None:
 
 
 @native
+@pytest.mark.skipif(not hasattr(linux.libc, "malloc_trim"), reason="the C library has no malloc_trim")
+def test_what_a_burst_left_free_below_the_heaps_top_is_given_back() -> None:
+    out = run_python(
+        "from pmutools import linux\n"
+        "def mib(): return int(open('/proc/self/statm').read().split()[1]) * 4 / 1024\n"
+        "burst = [bytearray(8192) for _ in range(8000)]\n"
+        "kept = burst[-1]; burst.clear(); before = mib()\n"
+        "linux.trim_heap(); print(before, mib())"
+    )
+    before, after = map(float, out.split())
+    assert before - after > 30
+
+
+@native
 @pytest.mark.realtime
 def test_memory_that_is_only_reserved_is_not_filled_by_the_lock() -> None:
     out = run_python(

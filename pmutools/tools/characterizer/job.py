@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pmutools import linux
 from pmutools.c37118.batch import NO_TIME
 from pmutools.c37118.demux import Loss, Message
 from pmutools.clock import Clock, UtcOffset, utc_offset
@@ -36,6 +37,8 @@ LEAST_STEP_NS = 100_000
 """A clock that was set by less is not told from reading it twice."""
 CLOCK_NS = 10 * NS
 """How often the receiver's clock is looked after."""
+TRIM_NS = 10 * NS
+"""How often what a backlog left free is given back: without it a run of days is as large as its worst second."""
 FIT_NS = 4 * NS
 """Fits are made until so long after the end; streams beyond that are told without."""
 LEDGER_NS = 5 * NS
@@ -124,7 +127,7 @@ class Job:
         engine, clock = self.engine, self._clock
         self._extra = lambda: _bytes_of(source) | {"unwanted_frames": source.receivers.unwanted}
         recorder = self._record(live=True)
-        offset, sample_ns = utc_offset(clock, 3), 0
+        offset, sample_ns, trim_ns = utc_offset(clock, 3), 0, clock.monotonic_ns() + TRIM_NS
         watch = HostWatch(source, engine)
         for items in source.rounds(self._settings.round_ns):
             now_ns = clock.realtime_ns()
@@ -134,6 +137,9 @@ class Job:
             if sample_clock is not None and clock.monotonic_ns() >= sample_ns:
                 sample_ns = clock.monotonic_ns() + CLOCK_NS
                 engine.sample_clock(sample_clock())
+            if clock.monotonic_ns() >= trim_ns:
+                trim_ns = clock.monotonic_ns() + TRIM_NS
+                linux.trim_heap()
             recorder.look(now_ns)
             observe(engine, items)
         if sample_clock is not None:
