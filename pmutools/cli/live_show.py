@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from pmutools.c37118.config import StreamConfig
@@ -14,6 +14,7 @@ from pmutools.cli.watch_display import WatchScreen
 from pmutools.cli.watch_keys import Command
 from pmutools.clocksources.watch import ClockWatch
 from pmutools.flow import Flow
+from pmutools.formats import JOURNAL
 from pmutools.formats.source import Block
 from pmutools.measure.stream import WAIT_NS
 from pmutools.net.dialogue import LinkEvent
@@ -84,7 +85,9 @@ class LiveShow:
 
 
 def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:  # not there yet, or not any more
-        return 0
+    """Of a recording, with the journal that holds what an unfinished table does not yet."""
+    size = 0
+    for each in (path, path.with_name(path.name + JOURNAL)):
+        with suppress(OSError):  # not there yet, or not any more
+            size += each.stat().st_size
+    return size
