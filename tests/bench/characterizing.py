@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from bench.host import Look, growth_mib, rss_kib
 from bench.layouts import RATE, B
 from bench.pacing import PORT
 from bench.table import Budget, Row
@@ -31,6 +32,8 @@ from pmutools.tools.characterizer.samples import Samples
 PER_BLOCK = RATE // 4
 STREAMS = 1000
 _PMU = (sys.executable, "-c", "from pmutools.cli import main; main()")
+GROWTH_MIB = 16.0
+"""Memory may grow by no more in the second half."""
 END_S = 10.0
 """What is written in the end may take so long."""
 
@@ -99,7 +102,7 @@ def soak(seconds: int, pmus: int = STREAMS) -> int:
     capture = Path(__file__).resolve().parents[2] / "captures" / "cjb-8pmu.pcap"
     url = f"udp://127.0.0.1:{PORT}"
     play = [*_PMU, "play", str(capture), "--to", url, "--emulate", str(pmus), "--loop", "0", "--duration", str(seconds)]
-    memory: list[int] = []
+    memory: list[Look] = []
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         measure = [*_PMU, "characterize", url, "--out", str(out), "--no-samples", "--no-report", "--quiet"]
@@ -110,8 +113,8 @@ def soak(seconds: int, pmus: int = STREAMS) -> int:
             began = time.monotonic()
             while playing.poll() is None and time.monotonic() - began < seconds + 60:
                 time.sleep(min(10.0, max(1.0, seconds / 20)))
-                memory.append(_rss_kib(measuring.pid))
-                print(f"{time.monotonic() - began:6.0f} s  {memory[-1] / 1024:7.1f} MiB", flush=True)
+                memory.append((measuring.pid, rss_kib(measuring.pid)))
+                print(f"{time.monotonic() - began:6.0f} s  {memory[-1][1] / 1024:7.1f} MiB", flush=True)
                 if playing.stdout is not None and time.monotonic() - began > seconds:
                     break
             assert playing.stdout is not None
@@ -124,20 +127,12 @@ def soak(seconds: int, pmus: int = STREAMS) -> int:
         told = json.loads((out / "summary.json").read_text())["all"]
     sent = sum(stream["fates"].get("sent", 0) for stream in streams)
     received, drops = told["received"] + told["duplicated"] + told["stale"], told["own_drops"]
-    # streams that take their seats, and rings that fill, are over after half the time
-    steady = [kib for kib in memory[len(memory) // 2 :] if kib]
-    growth = (steady[-1] - steady[0]) / 1024 if len(steady) > 1 else 0.0
+    # streams that take their seats, and rings that fill, are over after half the time; a backlog passes
+    growth = growth_mib(memory)
+    # the socket also drops some of the configurations that are sent each minute: the sum may exceed what was sent
     print(f"{sent} frames of {pmus} PMUs sent, {received} received, {drops} dropped by this machine's socket")
     print(f"memory grew by {growth:.1f} MiB in the second half; the end took {took_s:.1f} s")
-    return int(not (received + drops >= sent * 0.9999 and growth < 16 and took_s < END_S))
-
-
-def _rss_kib(pid: int) -> int:
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("VmRSS")), 0)
+    return int(not (received + drops >= sent * 0.9999 and growth < GROWTH_MIB and took_s < END_S))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ that is stopped, and in the first half one that is killed, so that each process 
 from __future__ import annotations
 
 import signal
-import statistics
 import sys
 import tempfile
 import time
@@ -16,7 +15,7 @@ from itertools import cycle, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.host import rss_kib, steal_s
+from bench.host import Look, growth_mib, rss_kib, steal_s
 from bench.waking import FLEET, stranger
 from support.running import PROCESSES, Running, flood
 
@@ -25,12 +24,10 @@ from dcon.session.replay import replay
 from pmutools.timebase import NS
 
 GROWTH_MIB = 4.0
-"""A process may grow by no more in the second half: medians of its first and its last quarter."""
+"""A process may grow by no more in the second half."""
 RATE_HZ = 60
 LONGEST_S = 60.0
 """Between two disturbances."""
-Look = tuple[int, int]
-"""A process and its resident memory in KiB."""
 
 
 class Account(NamedTuple):
@@ -55,16 +52,6 @@ def account(ticks_ns: Sequence[int], missing: int, skipped: int) -> Account:
         raise ValueError("ticks are not in order")
     due = round((ticks_ns[-1] - ticks_ns[0]) * RATE_HZ / NS) + 1 if ticks_ns else 0
     return Account(due, len(ticks_ns), missing, skipped)
-
-
-def growth_mib(looks: Sequence[Look]) -> float:
-    """Of one process in the second half of all looks; not a number where it was another one then."""
-    second = looks[len(looks) // 2 :]
-    if len({pid for pid, _ in second}) != 1 or len(second) < 4:
-        return float("nan")
-    quarter = len(second) // 4
-    first, last = ([kib for _, kib in part] for part in (second[:quarter], second[-quarter:]))
-    return (statistics.median(last) - statistics.median(first)) / 1024
 
 
 def soak(seconds: float) -> int:

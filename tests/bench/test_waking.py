@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import pytest
-from bench.running import account, growth_mib
+from bench.host import growth_mib
+from bench.running import account
 from bench.waking import Histogram, histogram, summed
 
 from dcon.session.codec import Timing
