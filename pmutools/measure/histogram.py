@@ -182,15 +182,16 @@ class Histogram:
         indices, counts = self._kept_singly()
         numbers, sizes = np.unique(indices >> _PAGE_BITS, return_counts=True)
         many = np.isin(indices >> _PAGE_BITS, numbers[sizes >= _FEW])
-        self._few, self._few_counts = (
-            array(kept.typecode, column[~many].tolist())
-            for kept, column in ((self._few, indices), (self._few_counts, counts))
-        )
+        self._keep_singly(indices[~many], counts[~many])
         self._count_all(indices[many], counts[many])
         self._few_most = _LOOKED_FROM + 2 * len(self._few)
 
     def _kept_singly(self) -> tuple[Ints, Ints]:
         return np.array(self._few, np.int64), np.array(self._few_counts, np.int64)
+
+    def _keep_singly(self, indices: Ints, counts: Ints) -> None:
+        self._few = array("i", indices.astype(np.intc).tobytes())
+        self._few_counts = array("q", counts.astype(np.int64).tobytes())
 
     def _combine(self, count: int, mean: float, m2: float, low: int, high: int) -> None:
         """Take in the moments of ``count`` more values (Chan, Golub and LeVeque 1979)."""
@@ -217,8 +218,14 @@ class Histogram:
         for number, page in other._pages.items():
             mine = self._page(number, other._totals[number])
             mine += page.astype(mine.dtype)
-        for index, count in zip(other._few, other._few_counts, strict=True):
-            self._count_one(index, count)
+        indices, counts = other._kept_singly()
+        on_page = np.isin(indices >> _PAGE_BITS, list(self._pages))
+        self._count_all(indices[on_page], counts[on_page])
+        mine, my_counts = self._kept_singly()
+        few, places = np.unique(np.concatenate((mine, indices[~on_page])), return_inverse=True)
+        sums = np.zeros(len(few), np.int64)
+        np.add.at(sums, places, np.concatenate((my_counts, counts[~on_page])))
+        self._keep_singly(few, sums)
         if len(self._few) > self._few_most:
             self._open_pages()
 
