@@ -16,7 +16,7 @@ LAYERS = [
     # ground floor, lowest first
     ["pmutools", "pmutools.errors", "pmutools.flow", "pmutools.timebase", "pmutools.draws", "pmutools.loglinear"],
     ["pmutools.linux", "pmutools.parsers"],
-    ["pmutools.clock", "pmutools.linux_columns", "pmutools.realtime", "pmutools.settings"],
+    ["pmutools.clock", "pmutools.linux_columns", "pmutools.log_thread", "pmutools.realtime", "pmutools.settings"],
     ["pmutools.host", "pmutools.linux_receive", "pmutools.pacing"],
     # the codec, sans-I/O
     ["pmutools.c37118"],

@@ -23,20 +23,20 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
     from dcon.link.paths import prepare
     from dcon.platform.output import OutputProcess
     from dcon.settings import load
+    from pmutools.log_thread import log_in_thread
     from pmutools.realtime import go_realtime
 
     talk = Talk(quiet, verbose)
     settings = load(ini)
     process = OutputProcess(settings.output, prepare(run_dir))
     before = {number: signal.signal(number, lambda *_: process.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
-    missing = go_realtime(
-        fifo=settings.platform.fifo
-    )  # a thread that talks to a bus is there already, and stays as it is
-    if missing.fifo:
-        talk.say(f"running at the normal scheduling policy: {missing.fifo}")
-    talk.say(f"driving {settings.output.url}; Ctrl-C ends")
     try:
-        process.run()
+        with log_in_thread():  # threads that are there already stay at the normal policy
+            missing = go_realtime(fifo=settings.platform.fifo)
+            if missing.fifo:
+                talk.say(f"running at the normal scheduling policy: {missing.fifo}")
+            talk.say(f"driving {settings.output.url}; Ctrl-C ends")
+            process.run()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -56,6 +56,7 @@ def command(
     from dcon.link.notify import STOPPING, Notifier
     from dcon.platform.orders import parse_order
     from dcon.settings import load
+    from pmutools.log_thread import log_in_thread
     from pmutools.timebase import parse_utc
 
     talk = Talk(quiet, verbose)
@@ -69,7 +70,7 @@ def command(
     if folder is not None and log is not None:
         raise SettingsError("--log: with a run folder the server writes the log; set [log] path for it")
     notifier = Notifier()
-    with _session(settings, Path(ini), folder, log or settings.log.path, notifier) as platform:
+    with log_in_thread(), _session(settings, Path(ini), folder, log or settings.log.path, notifier) as platform:
         summary = platform.run(orders=timed, start_ns=start_ns, duration_s=duration)
     notifier.tell(STOPPING)
     if as_json:

@@ -42,6 +42,7 @@ from pmutools import linux
 from pmutools.clocksources.asking import Patience
 from pmutools.clocksources.watch import HERE, ClockSources, Places
 from pmutools.errors import PmuError
+from pmutools.log_thread import log_in_thread
 from pmutools.measure.clockquality import ClockQuality
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.sockets import explain, resolve
@@ -295,7 +296,8 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
     try:
-        failure = work(aides(load(given.ini), paths.prepare(given.run_dir)), stopping.is_set)
+        with log_in_thread():  # a stuck reader of what is logged must not hold up the beats
+            failure = work(aides(load(given.ini), paths.prepare(given.run_dir)), stopping.is_set)
     except PmuError as error:
         failure = str(error)
     if failure:

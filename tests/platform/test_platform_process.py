@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from support.live import free_udp_port
+from support.live import free_ports, free_udp_port
 from support.running import descendants
 from support.swing import Streams
 
@@ -22,12 +25,12 @@ pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="run folders are Linux's"),
 ]
 NAMES = ("N1", "S1")
+QUIET = "\n[platform]\nfifo = no\ntime_source = none\n"
 
 
 def platform(folder: Path, *arguments: str, ports: list[int] | None = None) -> subprocess.Popen[str]:
     urls = [f"udp://127.0.0.1:{port}" for port in ports or [free_udp_port() for _ in NAMES]]
-    extra = "\n[platform]\nfifo = no\ntime_source = none\n"
-    (folder / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra=extra))
+    (folder / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra=QUIET))
     command = [sys.executable, "-m", "dcon.cli", "platform", "--ini", str(folder / "site.ini")]
     command += ["--run-dir", str(folder / "run"), *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -80,3 +83,26 @@ def test_it_ends_when_asked_to_while_it_still_waits_for_the_watchdog(tmp_path: P
     while any(Path(f"/proc/{pid}").exists() for pid in mine):
         assert time.monotonic() < end_s
         time.sleep(0.02)
+
+
+def test_a_stderr_that_nobody_reads_stops_no_tick(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    ini = Streams(NAMES).ini(urls=[f"tcp://127.0.0.1:{port}" for port in free_ports(2)], extra=QUIET)  # warns: refused
+    (tmp_path / "site.ini").write_text(ini)
+    command = [sys.executable, "-m", "dcon.cli", "platform", "--ini", str(tmp_path / "site.ini"), "--json"]
+    command += ["--log", str(tmp_path / "s.mcap"), "--duration", "2"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=writer, text=True) as process:
+        os.close(writer)
+        assert process.stdout is not None
+        told, _, _ = select.select([process.stdout], [], [], 30)
+        assert told, "it waits for whoever should read stderr"
+        summary = json.loads(process.stdout.readline())
+        with os.fdopen(reader, "rb") as stream:
+            said = stream.read()
+    assert summary["ticks"] > 60  # of the 120 of two seconds, of which it takes some to begin
+    assert b"WARNING" in said.replace(bytes(4096), b"")
