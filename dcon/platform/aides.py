@@ -37,7 +37,8 @@ from dcon.places import LineSource, ModbusLine
 from dcon.platform.gps_lock import Lock, Verdict, judge
 from dcon.platform.order_gate import OrderGate
 from dcon.platform.pulse import Pulse
-from dcon.settings import Platform, Settings, load
+from dcon.sections import Platform
+from dcon.settings import Settings, load
 from pmutools import linux
 from pmutools.clocksources.asking import Patience
 from pmutools.clocksources.watch import HERE, ClockSources, Places

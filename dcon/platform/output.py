@@ -22,7 +22,7 @@ from dcon.link.beats import LoopName, LoopState, Readback, encode_readback
 from dcon.link.paths import Sender
 from dcon.places import IioPlace, ModbusPlace
 from dcon.platform.pulse import Pulse
-from dcon.settings import Output
+from dcon.sections import Output
 from pmutools.clock import Clock, SystemClock
 from pmutools.errors import SettingsError
 

@@ -20,10 +20,12 @@ from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
 from dcon.drivers import line_status, udp_command
 from dcon.places import IioKeys, OutputRegisters, StatusRegisters
-from dcon.settings import ELSEWHERE, LineInput, Log, Output, Platform, Server, Site
+from dcon.sections import LineInput, Log, Output, Platform, Server
+from dcon.settings import ELSEWHERE
 from generate.markdown import attribute_docs, code, fenced, mermaid, prose, table
 from pmutools.grid.plant import PLANTS
 from pmutools.grid.scenarios import SCENARIOS
+from pmutools.sites import Site
 
 Transitions = Mapping[tuple[Any, Any], StrEnum]
 MANY = 4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dcon.settings import Watchdog
+from dcon.sections import Watchdog
 from dcon.watchdog import codec
 from dcon.watchdog.core import TRANSITIONS, Trigger
 from dcon.watchdog.limits import BOUNDS, Limits

@@ -26,9 +26,9 @@ from bench.table import Budget, Row
 from support.running import Running, flood
 from support.swing import Streams
 
+from dcon.sections import Platform
 from dcon.session.codec import Timing
 from dcon.session.log import SessionReader
-from dcon.settings import Platform
 from pmutools.grid.pmu_model import fleet
 from pmutools.timebase import NS
 

@@ -18,7 +18,7 @@ from dcon.link.beats import LoopState
 from dcon.link.paths import CONTROL, WATCHDOG, prepare
 from dcon.platform.aides import GpsAide
 from dcon.platform.gps_lock import FRESH_NS, Lock, Verdict, judge
-from dcon.settings import Platform
+from dcon.sections import Platform
 from pmutools.clocksources.asking import NoAnswer
 from pmutools.clocksources.chrony import Chronyd
 from pmutools.clocksources.gpsd import Gpsd

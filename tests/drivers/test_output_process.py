@@ -24,7 +24,7 @@ from dcon.link.beats import LoopState
 from dcon.link.paths import CONTROL, OUTPUT, WATCHDOG, prepare
 from dcon.places import destination
 from dcon.platform.output import OutputProcess
-from dcon.settings import Output
+from dcon.sections import Output
 from pmutools.cli.shell import run
 from pmutools.errors import SettingsError, SourceError
 

@@ -18,13 +18,14 @@ from support.shipped import INI, FakeControl, eventually, free_port, recorder_in
 from dcon.link import paths
 from dcon.link.bundle import Bundle, Kind, decode
 from dcon.link.paths import bind_datagram, prepare
+from dcon.sections import Log
 from dcon.server import scribe, server
 from dcon.server.client import Client
 from dcon.server.recorder import Recorder, Report
 from dcon.server.scribe import Scribe
 from dcon.server.server import Server
 from dcon.session.log import SessionReader
-from dcon.settings import Log, parse
+from dcon.settings import parse
 
 BUNDLE = Bundle(Kind.TICK, 0, 7, tick_at(0).record.tick_ns)
 

@@ -14,7 +14,8 @@ import pytest
 
 from dcon.cli.watchdog import arguments
 from dcon.effective import effective
-from dcon.settings import Settings, Watchdog, parse
+from dcon.sections import Watchdog
+from dcon.settings import Settings, parse
 from dcon.watchdog.__main__ import config_of
 from dcon.watchdog.files import Lines
 from dcon.watchdog.limits import BOUNDS, Limits, Rules
