@@ -137,6 +137,21 @@ def _lag(status: dict[str, Any]) -> str:
     return "none" if lag_s is None else f"{lag_s:.1f} s behind"
 
 
+def relays_line(watchdog: dict[str, Any]) -> str:
+    """What the watchdog says, and why."""
+    words = [f"relays {'closed' if watchdog['relays_closed'] else 'open'}"]
+    if watchdog["latched"]:
+        words.append("tripped")
+    causes = watchdog.get("causes")
+    if causes is None:
+        words.append("the watchdog is silent: this is old")
+    elif causes:
+        words.append(f"causes: {' '.join(causes)}")
+    if beats := [f"{name} {age:.0f}" for name, age in watchdog["beats_ms"].items() if age is not None]:
+        words.append(f"beats in ms: {' '.join(beats)}")
+    return "; ".join(words)
+
+
 def _text(status: dict[str, Any]) -> str:
     if status.get("state") is None:
         return _line(status)
@@ -149,9 +164,7 @@ def _text(status: dict[str, Any]) -> str:
     if not status["controller_connected"]:
         lines.append("the controller is not connected: this is old")
     if watchdog is not None:
-        relays = "closed" if watchdog["relays_closed"] else f"open: {watchdog['reason']}"
-        beats = " ".join(f"{name} {age:.0f}" for name, age in watchdog["beats_ms"].items() if age is not None)
-        lines.append(f"relays {relays}; beats in ms: {beats}")
+        lines.append(relays_line(watchdog))
     for pmu in status["pmus"]:
         age, f = pmu["age_ms"], pmu["f_hz"]
         shown = "nothing yet" if age is None else f"{age:.0f} ms old" + ("" if f is None else f", {f:.4f} Hz")

@@ -50,7 +50,7 @@ TRANSITIONS: Final[dict[tuple[SystemState, Trigger], SystemState]] = {
 DRIVING: Final = frozenset((_S.ACTIVE, _S.RAMPDOWN))
 """States with a command; in all others it is 0 MW."""
 ENGAGED: Final = DRIVING | {_S.ARMED}
-"""States with closed relays."""
+"""States in which closed relays are asked for."""
 MODE_IS_FREE: Final = frozenset((_S.OFF, _S.INIT, _S.STANDBY, _S.FAULT, _S.ESTOP))
 """States in which the mode may change: no path from open to closed loop that skips the two steps of arming."""
 

@@ -13,6 +13,7 @@ from dcon.core.checks import Action, Check, Scope, SystemValue, SystemView
 from dcon.core.line import line_status, margin_mw
 from dcon.core.params import Params
 from dcon.core.system import ENGAGED
+from dcon.core.values import SystemState
 from dcon.limiter import MW_PER_V
 
 
@@ -89,6 +90,12 @@ def emergency_stop(params: Params, view: SystemView) -> float | None:
     return _told(None if released is None else float(released), params.required.watchdog)
 
 
+def relays(_params: Params, view: SystemView) -> float | None:
+    """1 where the relays are closed, in ARMED and ACTIVE."""
+    closed = view.surroundings.relays_closed
+    return float(closed) if closed is not None and view.state in _HELD_CLOSED else None
+
+
 def server(params: Params, view: SystemView) -> float | None:
     """Silence of the server."""
     return _told(view.surroundings.server_age_s, params.required.server)
@@ -131,6 +138,8 @@ def _told(value: float | None, required: bool) -> float | None:
     return math.nan if value is None and required else value
 
 
+_HELD_CLOSED = (SystemState.ARMED, SystemState.ACTIVE)
+"""RAMPDOWN is on its way to open relays."""
 _WARN = (Scope.SYSTEM, Action.WARN)
 _DISARM = (Scope.SYSTEM, Action.DISARM)
 _TRIP = (Scope.SYSTEM, Action.TRIP)
@@ -177,4 +186,5 @@ SURROUNDINGS_ROWS: tuple[Check[SystemValue], ...] = (
     ),
     Check("server", *_WARN, server, "the server is silent; control goes on", "server_age_s"),
     Check("disk", *_WARN, disk, "the disk is nearly full", math.inf, "disk_min_percent"),
+    Check("relays_open", *_DISARM, relays, "the relays are open, and nothing passes", *_YES, "relays_open_s"),
 )

@@ -140,6 +140,8 @@ class Thresholds:
     """For so many ticks."""
     gps_holdover_s: float = setting(5.0, "s", "choice", 0, 3600)
     """Time since the controller's clock last had its GPS lock: disarm above."""
+    relays_open_s: float = setting(0.5, "s", "choice: they close within a tick of arming", 0.1, 10)
+    """Relays open for so long, in ARMED or ACTIVE: disarm."""
     response_gain_min: float = setting(0.7, "", "choice", 0, 1)
     """Response of the line to the command, as estimated: warn, then disarm below."""
     response_gain_max: float = setting(1.3, "", "choice", 1, 10)

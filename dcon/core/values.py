@@ -124,6 +124,8 @@ class Surroundings(NamedTuple):
     """Of the disk that is logged to."""
     unread: tuple[int, ...] = ()
     """Frames of each PMU, in the order of ``Params.pmus``, that came and could not be read; () is none."""
+    relays_closed: bool | None = None
+    """By the watchdog's word: the command passes."""
 
 
 NOTHING: Final = Surroundings()

@@ -174,10 +174,11 @@ class ShippedLog:
         surroundings: Surroundings = NOTHING,
     ) -> None:
         entries = tick_entries(self._instances, record, readings, orders, timing=timing, surroundings=surroundings)
-        if (watchdog := watchdog_of(self._news.heard, record.tick_ns)) is not None and self._is_due(watchdog):
+        now_ns = self._clock.monotonic_ns()
+        watchdog = watchdog_of(self._news.heard, record.tick_ns, now_ns)
+        if watchdog is not None and self._is_due(watchdog):
             entries.append(watchdog_entry(watchdog))
             self._shown = watchdog
-        now_ns = self._clock.monotonic_ns()
         self._shipping.shipper.tick(record.tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
         self._ticks += 1

@@ -125,22 +125,30 @@ def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
         response_lag_ms=server.response_lag_ms,
         server_age_s=silent_ns / 1e9,
         disk_free_percent=server.disk_free_percent,
+        relays_closed=None if status is None or is_silent(heard, now_ns) else status.closed,
     )
 
 
-def watchdog_of(heard: Heard, time_ns: int) -> Watchdog | None:
-    """The watchdog's state for the log, as known at ``time_ns`` (POSIX UTC); None before it has said anything."""
+def watchdog_of(heard: Heard, time_ns: int, now_ns: int) -> Watchdog | None:
+    """The watchdog's state for the log, as known at ``time_ns`` (POSIX UTC), which is ``now_ns`` (monotonic); None
+    before it has said anything."""
     status = heard.status
     if status is None:
         return None
     latched = status.state is WatchdogState.TRIPPED
-    return Watchdog(time_ns, status.closed, not status.estop_released, latched, " ".join(status.causes))
+    silent = is_silent(heard, now_ns)
+    return Watchdog(time_ns, status.closed, not status.estop_released, latched, " ".join(status.causes), silent=silent)
+
+
+def is_silent(heard: Heard, now_ns: int) -> bool:
+    """Whether the watchdog has said nothing for longer than it may."""
+    return heard.status is None or now_ns - heard.status.monotonic_ns > heard.patience_ns
 
 
 def is_healthy(heard: Heard, now_ns: int) -> bool:
     """Whether the watchdog lives, has not tripped, and would close its relays."""
     status = heard.status
-    if status is None or now_ns - status.monotonic_ns > heard.patience_ns:
+    if status is None or is_silent(heard, now_ns):
         return False
     return status.healthy and status.state is not WatchdogState.TRIPPED
 

@@ -167,6 +167,7 @@ class Newest:
             "estop": watchdog.estop,
             "latched": watchdog.latched,
             "reason": watchdog.reason,
+            "causes": None if watchdog.silent else watchdog.reason.split(),
             "beats_ms": dict(zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)),
         }
 

@@ -45,7 +45,10 @@ class Watchdog(NamedTuple):
     estop: bool = False
     latched: bool = False
     reason: str = ""
+    """Causes that are up, or latched, with blanks between them."""
     heartbeats: tuple[tuple[str, float], ...] = ()
+    silent: bool = False
+    """It has said nothing for too long: this is its last word."""
 
 
 def encode_tick(record: Record, instances: Sequence[str]) -> bytes:
@@ -183,6 +186,7 @@ def encode_watchdog(watchdog: Watchdog) -> bytes:
         reason=watchdog.reason,
         heartbeat=[name for name, _ in watchdog.heartbeats],
         heartbeat_age_ms=[age for _, age in watchdog.heartbeats],
+        silent=watchdog.silent,
     )
     return bytes(message.SerializeToString())
 

@@ -122,9 +122,10 @@ MESSAGES: dict[str, MessageType] = {
             Field("relays_closed", "bool", "Whether the output reaches the converter."),
             Field("estop", "bool", "Emergency stop pressed."),
             Field("latched", "bool", "Tripped and waiting for a manual reset."),
-            Field("reason", "string", "Why the relays are open; empty where they are closed."),
+            Field("reason", "string", "Causes that are up or latched by a trip, by name; empty for none."),
             Field("heartbeat", "string", "Components watched.", "", True),
             Field("heartbeat_age_ms", "double", "Age of each component's last heartbeat.", "ms", True),
+            Field("silent", "bool", "It has said nothing for longer than it may: this is its last word."),
         ),
     ),
     "Timing": MessageType(
@@ -186,6 +187,7 @@ MESSAGES: dict[str, MessageType] = {
             Field("pdci_scheduled_mw", "double", "Scheduled power, north to south.", "MW"),
             Field("pdci_in_service", "bool", "The line transmits and is not blocked."),
             Field("pdci_dcon_enabled", "bool", "The line's own controls accept the command."),
+            Field("relays_closed", "bool", "By the watchdog's word, the command passes."),
         ),
     ),
 }

@@ -399,6 +399,7 @@ def remembered(**changed: Any) -> tuple[Params, SystemView]:
     return PARAMS, view(feedback=QUIET._replace(**changed))
 
 
+OPEN = Surroundings(relays_closed=False)
 RATED = ((0.5, (900.0, 0.6)), (-0.5, (0.6, 900.0)))
 """At half a megawatt: the rating of the other direction does not count."""
 PEAKS = (90.0, 80.0, 75.0, 60.0, 50.0, 40.0, 30.0)
@@ -431,6 +432,12 @@ SYSTEM = [
     *of(system_rows.watchdog, *((seen(watchdog_healthy=ok), ok) for ok in (None, True, False)), (seen(STRICT), NAN)),
     *of(system_rows.emergency_stop, *((seen(estop_released=ok), ok) for ok in (None, True, False))),
     *of(system_rows.emergency_stop, (seen(STRICT), NAN)),
+    *of(
+        system_rows.relays,
+        *((seen(relays_closed=closed), closed) for closed in (None, True, False)),
+        *((seen(STRICT), None), ((PARAMS, view(state=SystemState.ARMED, surroundings=OPEN)), 0.0)),
+        *(((PARAMS, view(state=state, surroundings=OPEN)), None) for state in (SystemState.RAMPDOWN, SystemState.INIT)),
+    ),
     *of(system_rows.server, *((seen(server_age_s=age), age) for age in (None, 0.0, 7.0)), (seen(STRICT), NAN)),
     *of(system_rows.disk, (seen(disk_free_percent=7.0), 7.0)),
     *of(system_rows.gps, (seen(STRICT), NAN)),

@@ -83,6 +83,7 @@ DESIGN = {
     "response_lag_lost": ("system", "disarm", -INF, 60.0, 600),
     "server": ("system", "warn", -INF, 2.0, 1),
     "disk": ("system", "warn", 10.0, INF, 1),
+    "relays_open": ("system", "disarm", 1.0, INF, 30),
 }
 """Every check with its scope, action, bounds, and frames or ticks at 60/s: what the design asks for, written out."""
 
@@ -419,6 +420,7 @@ TOLD_CASES: dict[str, tuple[str, Surroundings, Surroundings]] = {
     "slow": ("response_lag", Surroundings(response_lag_ms=60.0), Surroundings(response_lag_ms=60.1)),
     "slow for long": ("response_lag_lost", Surroundings(response_lag_ms=60.0), Surroundings(response_lag_ms=60.1)),
     "server": ("server", Surroundings(server_age_s=2.0), Surroundings(server_age_s=2.1)),
+    "relays": ("relays_open", Surroundings(relays_closed=True), Surroundings(relays_closed=False)),
     "disk": ("disk", Surroundings(disk_free_percent=10.0), Surroundings(disk_free_percent=9.9)),
 }
 STATES = {Action.WARN: "ACTIVE", Action.DISARM: "STANDBY", Action.TRIP: "FAULT", Action.ESTOP: "ESTOP"}
@@ -459,6 +461,33 @@ def test_three_late_ticks_in_a_second_trip_and_two_do_not() -> None:
     rig.run(1, late).run(1, fine)
     rig.run(1, late)
     assert rig.records[-1].state == "FAULT" and rig.flag("overruns").value == 3
+
+
+def test_relays_are_open_for_half_a_second_at_most_and_only_where_closed_ones_are_asked_for() -> None:
+    """ARMED or ACTIVE: the ordinary time of closing passes; a ramp down and a disarmed controller are not judged."""
+    opened, shut = Surroundings(relays_closed=False), Surroundings(relays_closed=True)
+    rig = Rig(steady()).run(90, opened)
+    assert rig.records[-1].state == "STANDBY" and "relays_open" not in rig.seen()
+    rig.tick(Order("arm"), told=opened)
+    rig.run(29, opened).run(1, shut)  # they took their time
+    rig.run(29, opened)
+    assert rig.records[-1].state == "ARMED" and "relays_open" not in rig.seen()
+    rig.run(1, opened)
+    assert rig.records[-1].state == "STANDBY" and "relays_open" in rig.up
+    flag = rig.flag("relays_open")
+    assert flag.latched and (flag.value, flag.limit) == (0.0, 1.0)
+    rig.run(60, opened)
+    assert "relays_open" not in rig.up and rig.flag("relays_open").latched
+    assert rig.tick(Order("arm"), told=opened).state == "STANDBY"  # until it is acknowledged
+
+
+def test_no_word_of_relays_is_no_word_against_them() -> None:
+    """A watchdog that is required and tells of health only, as in sessions of before: nothing is judged."""
+    told = Surroundings(watchdog_healthy=True, estop_released=True)
+    rig = Rig(steady(), extra="[watchdog]\nrequired = yes").run(90, told)
+    rig.tick(Order("arm"), told=told)
+    rig.run(90, told)
+    assert rig.records[-1].state == "ARMED" and "relays_open" not in rig.seen()
 
 
 def test_late_ticks_trip_nothing_that_is_not_armed() -> None:

@@ -238,6 +238,7 @@ def test_the_watchdogs_table(tmp_path: Path) -> None:
         "reason": "E-stop",
         "heartbeat": '["control", "udp"]',
         "heartbeat_age_ms": "[3.5, 1.0]",
+        "silent": False,
     }
     assert (last["time_ns"], last["relays_closed"], last["heartbeat"]) == (T0 + 5, True, "[]")
 

@@ -112,11 +112,19 @@ def test_an_order_is_handed_on_once_with_who_ordered_it() -> None:
 
 
 def test_the_watchdog_s_state_as_the_log_has_it() -> None:
-    assert watchdog_of(heard(), 5) is None
+    assert watchdog_of(heard(), 5, T0) is None
     tripped = status(T0, estop=6, healthy=False, state=WatchdogState.TRIPPED, relays=1, causes=1 | 1 << 17)
-    assert watchdog_of(heard((T0, tripped)), 5) == Watchdog(5, False, True, True, "control estop_software")
+    assert watchdog_of(heard((T0, tripped)), 5, T0) == Watchdog(5, False, True, True, "control estop_software")
     closed = status(T0, state=WatchdogState.CLOSED, relays=3)
-    assert watchdog_of(heard((T0, closed)), 5) == Watchdog(5, True)
+    assert watchdog_of(heard((T0, closed)), 5, T0 + STATUS_NS) == Watchdog(5, True)
+    assert watchdog_of(heard((T0, closed)), 5, T0 + STATUS_NS + 1) == Watchdog(5, True, silent=True)
+
+
+@pytest.mark.parametrize(("relays", "closed"), [(0, False), (1, False), (2, False), (3, True)])
+def test_the_relays_are_as_the_watchdog_says_as_long_as_it_speaks(relays: int, closed: bool) -> None:
+    said = (T0, status(T0, relays=relays))
+    assert told(said, at=T0 + STATUS_NS).relays_closed is closed
+    assert told(said, at=T0 + STATUS_NS + 1).relays_closed is None
 
 
 BAD = [

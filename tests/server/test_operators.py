@@ -16,12 +16,14 @@ from support.operated import FakePlatform
 from support.shipped import ServerProcess, eventually
 
 from dcon.cli import dcon
+from dcon.cli.ctl import relays_line
 from dcon.link import paths
 from dcon.link.keys import add_key, read_keys
 from dcon.link.orders import SignedOrder, sign
 from dcon.link.paths import bind_datagram, prepare
 from dcon.server import operators
 from dcon.server.client import Client
+from dcon.session.codec import Watchdog
 from dcon.session.log import SessionReader
 from pmutools.cli.shell import run
 from pmutools.net.endpoint import Endpoint, Scheme
@@ -163,6 +165,26 @@ def test_status_has_everything(site: Site) -> None:
     assert len(status["instances"]) == 4 and len(status["events"]) <= 50
     assert status["server"]["failures"] == 0
     assert status["log"]["file"].endswith("session.mcap") and status["log"]["unlogged_ticks"] == 0
+
+
+CAUSES: list[tuple[Watchdog, list[str] | None, str]] = [
+    (Watchdog(1, True), [], "relays closed"),
+    (Watchdog(2, True, reason="server"), ["server"], "relays closed; causes: server"),
+    (
+        Watchdog(3, False, True, True, "control estop_software"),
+        ["control", "estop_software"],
+        "relays open; tripped; causes: control estop_software",
+    ),
+    (Watchdog(4, True, silent=True), None, "relays closed; the watchdog is silent: this is old"),
+]
+
+
+def test_what_the_watchdog_says_and_why(site: Site) -> None:
+    for watchdog, causes, line in CAUSES:
+        site.platform.control.watchdog = watchdog
+        site.until(lambda at=watchdog.time_ns: (site.status()["watchdog"] or {}).get("time_ns") == at)
+        said = site.status()["watchdog"]
+        assert said["causes"] == causes and relays_line(said) == line
 
 
 def test_watch_comes_twice_a_second(site: Site) -> None:

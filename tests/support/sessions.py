@@ -147,6 +147,7 @@ def _surroundings(rng: random.Random, pdci: Pdci | None) -> Surroundings:
         *(rng.choice((None, _float(rng))), rng.choice(yes_no)),
         *(rng.choice((None, _float(rng))) for _ in range(4)),
         rng.choice(((), (0, 3, 0, 1))),
+        rng.choice(yes_no),
     )
 
 

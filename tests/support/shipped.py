@@ -16,7 +16,8 @@ from dcon.link.paths import SERVER
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
 from dcon.server.recorder import Recorder
-from dcon.session.encode import tick_entries
+from dcon.session.codec import Watchdog
+from dcon.session.encode import tick_entries, watchdog_entry
 from dcon.session.log import SessionReader
 from pmutools.timebase import NS
 
@@ -45,6 +46,8 @@ class FakeControl:
         self.shipper = Shipper(session, HEAD.pieces(session), Ring(600 * NS, 64 << 20) if ring is None else ring)
         self.shipping = Shipping(folder / SERVER, self.shipper)
         self.ticks = 0
+        self.watchdog: Watchdog | None = None
+        """Logged with each tick, where there is one."""
         for name, frame in CONFIGS.items():
             self.shipper.config(name, frame, T0, time.monotonic_ns())
 
@@ -56,6 +59,8 @@ class FakeControl:
         entries = tick_entries(
             INSTANCES, record, tick.frames, given, timing=tick.timing, surroundings=tick.surroundings
         )
+        if self.watchdog is not None:
+            entries.append(watchdog_entry(self.watchdog))
         now_ns = time.monotonic_ns()
         self.shipper.tick(record.tick_ns, entries, now_ns)
         self.ticks += 1
