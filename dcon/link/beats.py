@@ -60,7 +60,7 @@ CAUSES: Final = (
     *LoopName,
     *("command_silent", "malformed", "range", "mismatch", "sequence", "stamp", "unasked"),
     *("readback_silent", "readback", "estop_software", "estop_a", "estop_b", "estop_discrepancy"),
-    *("relay_open", "relay_welded", "drive", "late"),
+    *("relay_open", "relay_welded", "drive", "late", "latch_unreadable"),
 )
 """Names of the bits of ``causes``, lowest first."""
 WHO_BYTES: Final = 32

@@ -17,15 +17,19 @@ from typing import Any, Final, NamedTuple
 from dcon.watchdog import codec, links
 from dcon.watchdog.core import Decision, Event, estop_bits, step
 from dcon.watchdog.files import Lines
+from dcon.watchdog.latch import NAME, Latch, found
 from dcon.watchdog.limits import TICK_MS, Rules
-from dcon.watchdog.memory import MS, Item, Memory
+from dcon.watchdog.memory import MS, Item, begun
+from dcon.watchdog.notify import ALIVE, READY, STOPPING, Notify
 from dcon.watchdog.report import Report
-from dcon.watchdog.rules import names_of
+from dcon.watchdog.rules import BIT, names_of
 from dcon.watchdog.system import go_realtime
 
 TICK_NS: Final = int(TICK_MS * MS)
 ROUND_NS: Final = MS
 """Rounds are at least so far apart."""
+ALIVE_NS: Final = 1000 * MS
+"""So often systemd is told, where it has asked for it."""
 ENDING: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
@@ -56,9 +60,14 @@ class Watchdog:
             self._report = Report(config.log, config.log_bytes)
         except OSError as error:
             raise links.Refused(f"{config.log}: {error.strerror}; name a log that can be written") from None
+        latch = os.path.join(config.folder, NAME)
+        latched = found(latch)
+        self._latch, self._trouble = Latch(latch, latched), ""
+        self._notify = Notify()
+        self._notified_ns: int | None = None
         now_ns = time.monotonic_ns()
         # a receiver passes over sequences below the last: those of a new process are above those of the old
-        self._memory = Memory(now_ns, sequence=time.time_ns() // MS % codec.WRAP)
+        self._memory = begun(now_ns, time.time_ns() // MS % codec.WRAP, latched, bool(latched & BIT["estop_software"]))
         self._counter = self._ticks = self._rounds = self._datagrams = 0
         self._driven = self._lines.drive(False, False, 0)
         self._latest_ms, self._latest_ns = 0.0, now_ns
@@ -78,7 +87,14 @@ class Watchdog:
         poller.register(self._inbox, select.POLLIN)
         due_ns = time.monotonic_ns()
         self._memory = self._memory._replace(now_ns=due_ns)
-        self._report.line(event="start", pid=os.getpid(), monotonic_ns=due_ns, qlen=_queue_length())
+        self._report.line(
+            event="start",
+            pid=os.getpid(),
+            monotonic_ns=due_ns,
+            qlen=_queue_length(),
+            state=self._memory.state.name,
+            causes=names_of(self._memory.latched),
+        )
         try:
             while not self._stopping:
                 poller.poll(max(0.0, (due_ns - time.monotonic_ns()) / MS))
@@ -105,11 +121,14 @@ class Watchdog:
             self._ticks += tick
             self._driven = self._lines.drive(decision.relay_a, decision.relay_b, self._ticks)
         self._send(decision, now_ns)
+        self._latch.hold(self._memory.latched)
         late_ms = self._memory.late_ms
         if late_ms >= self._latest_ms or now_ns - self._latest_ns > 1000 * MS:
             self._latest_ms, self._latest_ns = late_ms, now_ns
         for event in decision.events:
             self._tell(event, decision, now_ns)
+        self._look_at_latch()
+        self._tell_systemd(decision, now_ns)
 
     def _send(self, decision: Decision, now_ns: int) -> None:
         if (forward := decision.forward) is not None:
@@ -123,6 +142,20 @@ class Watchdog:
             self._counter += 1
             for listener in self._listeners:
                 listener.send(status)
+
+    def _tell_systemd(self, decision: Decision, now_ns: int) -> None:
+        """READY with the first round; then each second that rounds go on."""
+        if self._notified_ns is not None and now_ns - self._notified_ns < ALIVE_NS:
+            return
+        first, self._notified_ns = self._notified_ns is None, now_ns
+        status = " ".join((decision.state.name, *names_of(decision.causes)))
+        self._notify.tell(*((READY,) if first else ()), ALIVE, f"STATUS={status}")
+
+    def _look_at_latch(self) -> None:
+        """Tell where it cannot be kept for a new start; the state of this process does not depend on it."""
+        if (trouble := self._latch.trouble) != self._trouble:
+            self._trouble = trouble
+            self.warn(f"the latch cannot be kept: {trouble}" if trouble else "the latch is kept again")
 
     def _tell(self, event: Event, decision: Decision, now_ns: int) -> None:
         fields: dict[str, Any] = {"event": event.name, "monotonic_ns": now_ns, "state": decision.state.name}
@@ -140,11 +173,14 @@ class Watchdog:
         driven = self._lines.drive(False, False, 0)
         forward = codec.encode_command(self._memory.sequence, time.time_ns(), 0.0, 0.0, 0)
         self._output.send(forward)
+        self._notify.tell(STOPPING)
         memory = self._memory
         estop = estop_bits(memory)
         status = codec.encode_status(self._counter, time.monotonic_ns(), 0, estop, memory.state, False, memory.latched)
         for listener in self._listeners:
             listener.send(status)
+        self._latch.close()  # before anybody else may take this one's place, and look for it
+        self._look_at_latch()
         self._inbox.close()
         with suppress(OSError):
             os.unlink(self._path)

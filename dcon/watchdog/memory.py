@@ -124,6 +124,12 @@ class Memory(NamedTuple):
     """What was last told."""
 
 
+def begun(now_ns: int, sequence: int, latched: int, estop: bool) -> Memory:
+    """The memory of a watchdog that starts: tripped where it finds a latch, with its causes; else open. ``estop``: an
+    operator's word was among them, and asks to be released as before."""
+    return Memory(now_ns, sequence, State.TRIPPED if latched else State.OPEN, latched, estop=estop)
+
+
 def beaten(last: Loop | None, beat: Beat, now_ns: int) -> Loop:
     """A loop after a beat. A counter that goes back counts as one that has gone nearly all the way round."""
     if last is None:

@@ -33,8 +33,10 @@ CAUSES: Final = (
     "relay_welded",
     "drive",
     "late",
+    "latch_unreadable",
 )
-"""Bits of ``causes`` in a status, lowest first. All rules of one loop share the loop's bit."""
+"""Bits of ``causes`` in a status, lowest first. All rules of one loop share the loop's bit; the last is of no rule, but
+of a latch that was found at the start and could not be read."""
 
 
 class Action(StrEnum):

@@ -39,13 +39,13 @@ def _common(of: Transitions) -> dict[tuple[Any, StrEnum], set[StrEnum]]:
     return {key: states for key, states in sources.items() if len(states) >= MANY}
 
 
-def diagram(of: Transitions, start: str) -> str:
-    """A table of transitions as a state diagram."""
+def diagram(of: Transitions, *starts: str) -> str:
+    """A table of transitions as a state diagram; ``starts`` are states, or ``STATE: when`` of several."""
     common, labels = _common(of), defaultdict[tuple[str, str], list[str]](list)
     for (state, trigger), after in of.items():
         if (trigger, after) not in common:
             labels[state.name, after.name].append(str(trigger))
-    lines = ["stateDiagram-v2", f"    [*] --> {start}"]
+    lines = ["stateDiagram-v2", *(f"    [*] --> {start}" for start in starts)]
     lines += [f"    {a} --> {b}: {', '.join(texts)}" for (a, b), texts in labels.items()]
     everything = {state for state, _ in of}
     words = []

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dcon.sections import Watchdog
 from dcon.watchdog import codec
 from dcon.watchdog.core import TRANSITIONS, Trigger
+from dcon.watchdog.latch import NAME
 from dcon.watchdog.limits import BOUNDS, Limits
-from dcon.watchdog.rules import BIT, OTHERS, RULES, Action, Rule
+from dcon.watchdog.rules import BIT, CAUSES, OTHERS, RULES, Action, Rule
 from generate.controller import diagram
 from generate.markdown import attribute_docs, code, fenced, prose, table
 
@@ -49,7 +50,11 @@ def rules() -> str:
         bits = ", ".join(str(BIT[rule.cause].bit_length() - 1) for rule in members)
         rows.append(_row(bits, f"LOOP`{kind}`: {loops}", first, text))
     rows += [_row(str(BIT[rule.cause].bit_length() - 1), code(rule.name), rule, rule.text) for rule in OTHERS]
-    return table(("bit of `causes`", "rule", "judges", "up", "action", "what the operator reads"), rows)
+    shown = table(("bit of `causes`", "rule", "judges", "up", "action", "what the operator reads"), rows)
+    last = (
+        f"Bit {len(CAUSES) - 1}, {code(CAUSES[-1])}, is of no rule: a latch was found at the start, and not its causes."
+    )
+    return f"{shown}\n\n{last}"
 
 
 def settings() -> str:
@@ -71,7 +76,7 @@ def datagrams() -> str:
 
 
 GENERATORS = {
-    "watchdog-diagram": lambda: diagram(TRANSITIONS, "OPEN"),
+    "watchdog-diagram": lambda: diagram(TRANSITIONS, "OPEN", f"TRIPPED: {NAME} is there"),
     "watchdog-triggers": triggers,
     "watchdog-actions": actions,
     "watchdog-rules": rules,

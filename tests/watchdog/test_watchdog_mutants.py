@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +23,7 @@ import test_watchdog_core as scenes
 from support.guarded import RELEASED, RULES, T0_NS, TICK_NS, Bench
 from support.mutation import mutants, survivors
 
-from dcon.watchdog import codec, core, limits, memory, rules
+from dcon.watchdog import codec, core, latch, limits, memory, rules
 from dcon.watchdog.codec import Beat, Command, Malformed, Readback, Word
 from dcon.watchdog.memory import MS, Contact, Driven, Inputs, Loop, Memory, Offences, State, Worst
 
@@ -137,6 +139,12 @@ def take(*news: Any) -> Memory:
 
 USUAL_WORST = Worst(1.0, 0.0, 2.0, 0.0)
 MEMORY = [
+    *of(
+        memory.begun,
+        ((5, 9, 0, False), Memory(5, 9)),
+        ((5, 9, 3, False), Memory(5, 9, State.TRIPPED, 3)),
+        ((5, 9, 3, True), Memory(5, 9, State.TRIPPED, 3, estop=True)),
+    ),
     *of(memory.beaten, ((None, Beat(0, 8, 2), 9), Loop(8, 9, 9, 2, 9, 0, 0.0))),
     *of(
         memory.beaten,
@@ -354,6 +362,41 @@ JUDGING = [
     *of(rules.names_of, (0, ()), (1, ("control",)), (rules.BIT["late"] | 2, ("udp", "late"))),
 ]
 
+# --- the latch ---------------------------------------------------------------------------------------------------
+
+
+def left_there(text: bytes | None) -> int:
+    """What is found where a file has been left."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "latch")
+        if text is not None:
+            with open(path, "wb") as file:
+                file.write(text)
+        return latch.found(path)
+
+
+def kept(*causes: int) -> tuple[str, list[tuple[str, bytes, int]]]:
+    """What the last of some writings says, and the files after it: name, content, mode."""
+    with tempfile.TemporaryDirectory() as folder:
+        said = [latch.keep(os.path.join(folder, "latch"), cause) for cause in causes][-1]
+        files = []
+        for entry in os.scandir(folder):
+            with open(entry.path, "rb") as file:
+                files.append((entry.name, file.read(), entry.stat().st_mode & 0o777))
+    return said, files
+
+
+LATCHED = [
+    *of(latch.text_of, (3, b'{"causes": ["control", "udp"]}\n'), (rules.BIT["late"], b'{"causes": ["late"]}\n')),
+    *of(latch.causes_in, *((text, latch.UNREADABLE) for text in (b"", b"{}", b'{"causes": []}', b'{"causes": ["x"]}'))),
+    *of(latch.causes_in, (b'{"causes": ["udp", "late", "udp"]}', 2 | rules.BIT["late"])),
+    *of(left_there, (None, 0), (b"", latch.UNREADABLE), (latch.text_of(3), 3)),
+    (kept, (3,), ("", [("latch", latch.text_of(3), 0o600)])),
+    (kept, (3, 2), ("", [("latch", latch.text_of(2), 0o600)])),
+    (kept, (3, 0), ("", [])),
+    (kept, (0,), ("", [])),
+]
+
 # --- the limits and the limiter ----------------------------------------------------------------------------------
 
 LIMITS = [
@@ -493,13 +536,15 @@ STEPS: tuple[Any, ...] = (core.trigger_of, core.moved, core.events_of, core.forw
 
 # --- the trial ---------------------------------------------------------------------------------------------------
 
-FACTS = [*CODEC, *MEMORY, *VALUES, *JUDGING, *LIMITS, *CLOSING]
+FACTS = [*CODEC, *MEMORY, *VALUES, *JUDGING, *LATCHED, *LIMITS, *CLOSING]
 ABOUT: dict[Callable[..., Any], FunctionType] = {
     told_command: memory.commanded,
     read: memory.answered,
     look: memory.looked,
     take: memory.absorbed,
     found: rules.judge,
+    left_there: latch.found,
+    kept: latch.keep,
 }  # type: ignore[dict-item]
 """What a fact is about, where that is not the function that it calls."""
 FUNCTIONS: dict[FunctionType, list[Fact]] = {function: [] for function in STEPS}
@@ -554,7 +599,7 @@ def test_no_mutant_survives(function: FunctionType) -> None:
 
 
 def test_all_of_the_core_is_tried() -> None:
-    for module in (codec, memory, rules, limits, core):
+    for module in (codec, memory, rules, latch, limits, core):
         functions = {
             value
             for value in vars(module).values()
