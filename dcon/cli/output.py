@@ -20,6 +20,7 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
     Without a command for [output] hold_ms it goes to 0 V by itself. Ctrl-C leaves 0 V. Killed with SIGKILL it leaves
     the last value: then only the relays take it off the line.
     """
+    from dcon.link.notify import Notifier
     from dcon.link.paths import prepare
     from dcon.platform.output import OutputProcess
     from dcon.settings import load
@@ -28,7 +29,7 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
 
     talk = Talk(quiet, verbose)
     settings = load(ini)
-    process = OutputProcess(settings.output, prepare(run_dir))
+    process = OutputProcess(settings.output, prepare(run_dir), notifier=Notifier())
     before = {number: signal.signal(number, lambda *_: process.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with log_in_thread():  # threads that are there already stay at the normal policy

@@ -19,6 +19,7 @@ from dcon.drivers.modbus_output import ModbusDriver
 from dcon.drivers.outlet import Drive, Outlet
 from dcon.link import paths
 from dcon.link.beats import LoopName, LoopState, Readback, encode_readback
+from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.paths import Sender
 from dcon.places import IioPlace, ModbusPlace
 from dcon.platform.pulse import Pulse
@@ -28,6 +29,8 @@ from pmutools.errors import SettingsError
 
 LOG = logging.getLogger(__name__)
 BEAT_NS = 20_000_000
+ALIVE_NS = 1_000_000_000
+"""So often systemd is told that the rounds go on."""
 POLL_NS = 2_000_000
 """How often a readback is asked for that has not come yet."""
 REMEMBERED = 256
@@ -55,10 +58,18 @@ class OutputProcess:
     """One driver between ``output.in`` and the device."""
 
     def __init__(
-        self, output: Output, run_dir: Path, *, driver: Driver | None = None, clock: Clock | None = None
+        self,
+        output: Output,
+        run_dir: Path,
+        *,
+        driver: Driver | None = None,
+        clock: Clock | None = None,
+        notifier: Notifier | None = None,
     ) -> None:
         """Raises SourceError where another process has the place, or the device cannot be opened."""
         self._clock = clock or SystemClock()
+        self._notifier = notifier or Notifier({})
+        self._notified_ns: int | None = None
         self._inbox = paths.bind_datagram(run_dir, paths.OUTPUT)
         try:
             self.driver = driver or open_driver(output)
@@ -93,7 +104,9 @@ class OutputProcess:
                 if self._asked and now_ns >= self._poll_ns:
                     self._read_back(now_ns)
                 self._pulse.beat(now_ns, self._judge(now_ns))
+                self._notify(now_ns)
         finally:
+            self._notifier.tell(STOPPING)
             self._pulse.beat(self._clock.monotonic_ns(), LoopState.ENDING)
             self.driver.close()
             paths.release(self._inbox)
@@ -133,6 +146,14 @@ class OutputProcess:
             self._watchdog.send(answer)
             self._control.send(answer)
             self.readbacks += 1
+
+    def _notify(self, now_ns: int) -> None:
+        """READY with the first round; then each second that rounds go on, and how the device is."""
+        if self._notified_ns is not None and now_ns - self._notified_ns < ALIVE_NS:
+            return
+        first, self._notified_ns = self._notified_ns is None, now_ns
+        status = self.driver.trouble or f"{self.outlet.commands} commands, {self.readbacks} read back"
+        self._notifier.tell(*((READY,) if first else ()), ALIVE, status=status)
 
     def _judge(self, now_ns: int) -> LoopState:
         """FAILED while something has been wrong with the device for longer than the output may be held."""

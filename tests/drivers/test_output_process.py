@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from dcon.cli import dcon
 from dcon.drivers.outlet import CLOSED
 from dcon.drivers.udp_command import CommandOut, encode
 from dcon.link.beats import LoopState
+from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, OUTPUT, WATCHDOG, prepare
 from dcon.places import destination
 from dcon.platform.output import OutputProcess
@@ -173,6 +175,19 @@ def test_a_slow_bus_answers_for_the_commands_that_it_carried_out(folder: Path) -
                 time.sleep(0.016)  # the rhythm of a controller
             for readback in watchdog.readbacks():
                 assert readback.volts == pytest.approx(readback.sequence / 100)
+
+
+def test_systemd_is_told_that_it_is_ready_alive_and_stopping(tmp_path: Path, folder: Path) -> None:
+    name = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as service:
+        service.bind(name)
+        service.settimeout(20)
+        process = OutputProcess(iio_output(iio_device(tmp_path)), folder, notifier=Notifier({"NOTIFY_SOCKET": name}))
+        with in_thread(process.run, process.stop):
+            assert service.recv(200) == b"READY=1\nWATCHDOG=1\nSTATUS=0 commands, 0 read back"
+            assert service.recv(200).startswith(b"WATCHDOG=1\nSTATUS=")
+        while service.recv(200) != b"STOPPING=1":
+            pass
 
 
 def test_a_second_process_has_no_place(tmp_path: Path, folder: Path) -> None:
