@@ -5,7 +5,8 @@ Big-endian, CRC-32 (zlib) of all before it at the end::
     DCB1 beat      32 bytes  4s magic | 8s loop | I counter | q monotonic_ns | B state | 3x
     DCR1 readback  28 bytes  4s magic | I sequence answered | q monotonic_ns | d V
     DCO1 word      44 bytes  4s magic | B verb | 3x | 32s who
-    DCW1 status    28 bytes  4s magic | I counter | q monotonic_ns | B relays | B estop | B state | B healthy | I causes
+    DCW1 status    44 bytes  4s magic | I counter | q monotonic_ns | B relays | B estop | B state | B healthy | I causes
+                             | 8 H age of each loop's last beat in ms (65,534: that or more; 65,535: none came)
 
 The watchdog has a codec of its own for the same datagrams, and the tests hold the two together.
 """
@@ -64,6 +65,8 @@ CAUSES: Final = (
 )
 """Names of the bits of ``causes``, lowest first."""
 WHO_BYTES: Final = 32
+UNHEARD: Final = 0xFFFF
+"""Age in a status of a beat that never came."""
 
 
 class Readback(NamedTuple):
@@ -91,6 +94,8 @@ class WatchdogStatus(NamedTuple):
     """Every beat and input is good: the relays would close if they were asked to, or may stay closed."""
     causes: tuple[str, ...]
     """What is up, or was latched by a trip; ``server`` only warns."""
+    beats_ms: tuple[tuple[str, float], ...] = ()
+    """(loop, age of its last beat), of those that have beaten."""
 
     @property
     def closed(self) -> bool:
@@ -142,10 +147,10 @@ def encode_word(verb: Verb, who: str) -> bytes:
 
 def decode_status(datagram: bytes) -> WatchdogStatus | None:
     """None for anything else, and for a state that there is not."""
-    values = _without_crc(datagram, b"DCW1", "IqBBBBI")
+    values = _without_crc(datagram, b"DCW1", "IqBBBBI8H")
     if values is None or values[4] not in tuple(WatchdogState):
         return None
-    counter, monotonic_ns, relays, estop, state, healthy, causes = values
+    counter, monotonic_ns, relays, estop, state, healthy, causes, *ages = values
     return WatchdogStatus(
         counter,
         monotonic_ns,
@@ -157,4 +162,5 @@ def decode_status(datagram: bytes) -> WatchdogStatus | None:
         WatchdogState(state),
         bool(healthy),
         tuple(name for bit, name in enumerate(CAUSES) if causes >> bit & 1),
+        tuple((str(loop), float(age_ms)) for loop, age_ms in zip(LoopName, ages, strict=True) if age_ms != UNHEARD),
     )

@@ -185,9 +185,11 @@ class ShippedLog:
 
     def _is_due(self, watchdog: Watchdog) -> bool:
         shown = self._shown
+        if shown is None or watchdog.time_ns - shown.time_ns >= NS:
+            return True
         return (
-            shown is None or watchdog.time_ns - shown.time_ns >= NS or watchdog._replace(time_ns=shown.time_ns) != shown
-        )
+            watchdog._replace(time_ns=shown.time_ns, heartbeats=shown.heartbeats) != shown
+        )  # ages change all the time
 
     @property
     def unlogged_ticks(self) -> int:

@@ -137,7 +137,9 @@ def watchdog_of(heard: Heard, time_ns: int, now_ns: int) -> Watchdog | None:
         return None
     latched = status.state is WatchdogState.TRIPPED
     silent = is_silent(heard, now_ns)
-    return Watchdog(time_ns, status.closed, not status.estop_released, latched, " ".join(status.causes), silent=silent)
+    return Watchdog(
+        time_ns, status.closed, not status.estop_released, latched, " ".join(status.causes), status.beats_ms, silent
+    )
 
 
 def is_silent(heard: Heard, now_ns: int) -> bool:

@@ -4,7 +4,8 @@
     DCB1 beat      32 bytes  4s magic | 8s loop | I counter | q monotonic_ns | B state | 3x
     DCR1 readback  28 bytes  4s magic | I sequence answered | q monotonic_ns | d V
     DCO1 word      44 bytes  4s magic | B verb | 3x | 32s who
-    DCW1 status    28 bytes  4s magic | I counter | q monotonic_ns | B relays | B estop | B state | B healthy | I causes
+    DCW1 status    44 bytes  4s magic | I counter | q monotonic_ns | B relays | B estop | B state | B healthy | I causes
+                             | 8 H age of each loop's last beat in ms (65,534: that or more; 65,535: none came)
 
 Written apart from what the controller has for the same datagrams; the tests hold the two together.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 RELAYS: Final = 1
@@ -27,13 +29,15 @@ WRAP: Final = 1 << 32
 
 LOOPS: Final = ("control", "udp", "parse", "gps", "gui", "pdci", "server", "output")
 """Who may beat; a beat of anybody else is malformed."""
+UNHEARD: Final = 0xFFFF
+"""Age in a status of a beat that never came."""
 VERBS: Final = {1: "estop", 2: "estop_release", 3: "reset"}
 
 _COMMAND: Final = struct.Struct(">4sIqddI")
 _BEAT: Final = struct.Struct(">4s8sIqB3x")
 _READBACK: Final = struct.Struct(">4sIqd")
 _WORD: Final = struct.Struct(">4sB3x32s")
-_STATUS: Final = struct.Struct(">4sIqBBBBI")
+_STATUS: Final = struct.Struct(">4sIqBBBBI8H")
 _CRC: Final = struct.Struct(">I")
 LONGEST: Final = 64
 """No datagram is longer; of one that is so many bytes are read, and it is malformed."""
@@ -138,9 +142,18 @@ def encode_command(sequence: int, time_ns: int, mw: float, volts: float, flags: 
 
 
 def encode_status(
-    counter: int, monotonic_ns: int, relays: int, estop: int, state: int, healthy: bool, causes: int
+    counter: int,
+    monotonic_ns: int,
+    relays: int,
+    estop: int,
+    state: int,
+    healthy: bool,
+    causes: int,
+    ages_ms: Sequence[int] = (UNHEARD,) * len(LOOPS),
 ) -> bytes:
     """What the watchdog tells. ``relays``: bit 0 a, bit 1 b, closed; ``estop``: bits 0 software, 1 line a, 2 line b,
-    released; ``state``: 0 OPEN, 1 CLOSED, 2 TRIPPED; ``causes``: bits as in :data:`dcon.watchdog.rules.CAUSES`.
+    released; ``state``: 0 OPEN, 1 CLOSED, 2 TRIPPED; ``causes``: bits as in :data:`dcon.watchdog.rules.CAUSES`;
+    ``ages_ms``: of the beats, in the order of :data:`LOOPS`.
     """
-    return _sealed(_STATUS.pack(b"DCW1", counter % WRAP, monotonic_ns, relays, estop, state, healthy, causes))
+    told = (counter % WRAP, monotonic_ns, relays, estop, state, healthy, causes)
+    return _sealed(_STATUS.pack(b"DCW1", *told, *ages_ms))

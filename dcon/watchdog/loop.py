@@ -19,7 +19,7 @@ from dcon.watchdog.core import Decision, Event, estop_bits, step
 from dcon.watchdog.files import Lines
 from dcon.watchdog.latch import NAME, Latch, found
 from dcon.watchdog.limits import TICK_MS, Rules
-from dcon.watchdog.memory import MS, Item, begun
+from dcon.watchdog.memory import MS, Item, ages_ms, begun
 from dcon.watchdog.notify import ALIVE, READY, STOPPING, Notify
 from dcon.watchdog.report import Report
 from dcon.watchdog.rules import BIT, names_of
@@ -136,9 +136,8 @@ class Watchdog:
             self._output.send(codec.encode_command(forward.sequence, time_ns, forward.mw, forward.volts, forward.flags))
         if decision.tell:
             relays = decision.relay_a | decision.relay_b << 1
-            status = codec.encode_status(
-                self._counter, now_ns, relays, decision.estop, decision.state, decision.healthy, decision.causes
-            )
+            told = (relays, decision.estop, decision.state, decision.healthy, decision.causes)
+            status = codec.encode_status(self._counter, now_ns, *told, ages_ms(self._memory, now_ns))
             self._counter += 1
             for listener in self._listeners:
                 listener.send(status)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from dcon.watchdog.codec import LOOPS, WRAP, Beat, Command, Malformed, Readback, Word
+from dcon.watchdog.codec import LOOPS, UNHEARD, WRAP, Beat, Command, Malformed, Readback, Word
 from dcon.watchdog.limits import FULL_SCALE_V, MW_PER_V, REMEMBERED, TICK_MS, WINDOW_MS, Rules
 
 MS: Final = 1_000_000
@@ -219,6 +219,11 @@ def absorbed(rules: Rules, memory: Memory, news: Sequence[Item], now_ns: int) ->
             case Driven():
                 memory = memory._replace(drive_failed=not item.done)
     return memory
+
+
+def ages_ms(memory: Memory, now_ns: int) -> tuple[int, ...]:
+    """Of each loop's last beat, as a status tells them."""
+    return tuple(UNHEARD if loop is None else min((now_ns - loop.heard_ns) // MS, UNHEARD - 1) for loop in memory.loops)
 
 
 def forwarded(memory: Memory, volts: float, now_ns: int) -> Memory:

@@ -64,7 +64,10 @@ def test_a_command(sequence: int, time_ns: int, mw: float, volts: float, relays:
     assert udp_command.decode(passed) == udp_command.CommandOut(sequence, time_ns, mw, volts, 3)
 
 
-@given(U32, I64, *[st.booleans()] * 5, st.sampled_from(memory.State), st.booleans(), st.sets(st.integers(0, 24)))
+AGES = st.lists(st.integers(0, 65_535), min_size=8, max_size=8)
+
+
+@given(U32, I64, *[st.booleans()] * 5, st.sampled_from(memory.State), st.booleans(), st.sets(st.integers(0, 24)), AGES)
 def test_a_status(
     counter: int,
     at_ns: int,
@@ -76,15 +79,18 @@ def test_a_status(
     state: memory.State,
     healthy: bool,
     bits: set[int],
+    ages_ms: list[int],
 ) -> None:
     estop = software | line_a << 1 | line_b << 2
     causes = sum(1 << bit for bit in bits)
-    datagram = codec.encode_status(counter, at_ns, a | b << 1, estop, state, healthy, causes)
-    assert len(datagram) == 28
+    datagram = codec.encode_status(counter, at_ns, a | b << 1, estop, state, healthy, causes, ages_ms)
+    assert len(datagram) == 44
     status = beats.decode_status(datagram)
     assert status is not None
     assert status[:7] == (counter, at_ns, a, b, software, line_a, line_b)
     assert (status.state.name, status.healthy, status.causes) == (state.name, healthy, rules.names_of(causes))
+    heard = {loop: age_ms for loop, age_ms in zip(codec.LOOPS, ages_ms, strict=True) if age_ms < 65_535}
+    assert dict(status.beats_ms) == heard
     assert (status.closed, status.estop_released) == (a and b, software and line_a and line_b)
 
 

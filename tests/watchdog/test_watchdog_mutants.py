@@ -101,8 +101,15 @@ CODEC = [
     *of(
         codec.encode_status,
         *(
-            ((counter, 8, 3, 7, 2, True, 5), sealed(struct.pack(">4sIqBBBBI", b"DCW1", 9, 8, 3, 7, 2, 1, 5)))
+            (
+                (counter, 8, 3, 7, 2, True, 5),
+                sealed(struct.pack(">4sIqBBBBI", b"DCW1", 9, 8, 3, 7, 2, 1, 5) + b"\xff" * 16),
+            )
             for counter in (9, 2**32 + 9)
+        ),
+        (
+            (9, 8, 3, 7, 2, True, 5, range(8)),
+            sealed(struct.pack(">4sIqBBBBI8H", b"DCW1", 9, 8, 3, 7, 2, 1, 5, *range(8))),
         ),
     ),
 ]
@@ -114,6 +121,10 @@ FIRST = Memory(T0_NS, sequence=7)
 COMMAND = Command(10, NOW_NS, 12.5, 1.0, True, 2.0)
 HAVE = FIRST._replace(command=COMMAND, command_ns=NOW_NS - S, worst=Worst(9.0, 9.0, 9.0, 9.0))
 SENT_ONE = FIRST._replace(sent=((6, 1.0), (7, 2.0)), readbacks_off=1)
+
+
+HEARD_MS = (250, None, 65_533, 65_534, 65_535, 70_000, 0, None)
+HEARD = FIRST._replace(loops=tuple(None if ms is None else LOOP._replace(heard_ns=NOW_NS - ms * MS) for ms in HEARD_MS))
 
 
 def told_command(before: Memory, now_ns: int = NOW_NS, **changed: Any) -> tuple[Any, ...]:
@@ -246,6 +257,7 @@ MEMORY = [
             loops=(None, Loop(5, *(T0_NS + 30 * MS,) * 2, 1, T0_NS + 30 * MS), *(None,) * 6),
         ),
     ),
+    *of(memory.ages_ms, ((HEARD, NOW_NS), (250, 65_535, 65_533, 65_534, 65_534, 65_534, 0, 65_535))),
     *of(
         memory.forwarded,
         ((FIRST, 3.0, 9), FIRST._replace(sequence=8, sent=((7, 3.0),), sent_ns=9)),
