@@ -12,7 +12,7 @@ import numpy.typing as npt
 from dcon.core.differentiator import EMPTY, advance, coefficients
 from dcon.demo.course import Course
 from dcon.limiter import MW_PER_V
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from pmutools import timebase
 from pmutools.modal.matrix_pencil import ringdown
 

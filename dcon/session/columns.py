@@ -4,8 +4,8 @@
 >>> session.tick.command_mw                           # doctest: +SKIP
 >>> session.pmu["N1"].frequency_hz                    # doctest: +SKIP
 
-The values are those of :class:`~dcon.session.log.SessionReader`, to the last bit (but for |V1| and its angle, which are
-computed). It takes a quarter of the time, about ten seconds for an hour, and gives no other phasors, no bytes and no
+The values are those of :class:`~dcon.session.reader.SessionReader`, to the last bit (but for |V1| and its angle, which
+are computed). It takes a quarter of the time, about ten seconds for an hour, and gives no other phasors, no bytes and no
 reasons: an event tells why an instance was disabled.
 
 A log may be in parts, cut or damaged: what can be read is there, :attr:`SessionColumns.gaps` says between which ticks
@@ -39,9 +39,9 @@ from dcon.session.column_tables import (
     SessionColumns,
     TickColumns,
 )
-from dcon.session.log import SessionReader
 from dcon.session.newer import newer_in
 from dcon.session.parts import Part, Paths, is_apart
+from dcon.session.reader import SessionReader
 from pmutools.schema.columns import Texts, decode_columns
 from pmutools.schema.descriptors import message_class, unnamed_fields
 from pmutools.schema.log_reader import LogReader
@@ -82,7 +82,7 @@ def read_columns(paths: Paths, tables: Collection[str] = TABLES) -> SessionColum
 
     ``tables``: which of :data:`TABLES` to read beside ``tick``; ``event`` is events, orders, changes
     of flags, and watchdog. Raises
-    SourceError for what is no session log, as :class:`~dcon.session.log.SessionReader` does.
+    SourceError for what is no session log, as :class:`~dcon.session.reader.SessionReader` does.
     """
     reader = SessionReader(paths)
     builder = _Builder(reader, "instance" in tables)

@@ -11,9 +11,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dcon.session.log import SessionReader
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
+from dcon.session.reader import SessionReader
 from dcon.session.tables import TABLES, Column, Row, Table
 from pmutools.errors import SettingsError, SourceError
 from pmutools.formats.output import whole

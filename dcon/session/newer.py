@@ -6,7 +6,7 @@ import re
 from typing import Any, NamedTuple
 
 import pmutools
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from pmutools.schema.messages import MESSAGES
 
 SHOWN = 8

@@ -21,9 +21,9 @@ import pmutools
 from dcon.core.values import Order, Record
 from dcon.engine import Engine, Tick
 from dcon.session import codec
-from dcon.session.log import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
+from dcon.session.reader import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
 from dcon.session.rolling import LOG_SUBJECT
 from dcon.settings import parse
 from pmutools.c37118 import Frame, decode_config

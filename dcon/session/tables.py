@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from dcon.core.values import value_of
-from dcon.session.log import SessionReader, TickMessages
+from dcon.session.reader import SessionReader, TickMessages
 from pmutools.schema.messages import MESSAGES, Field
 
 ColumnType = Literal["int64", "uint64", "float64", "string", "bool"]

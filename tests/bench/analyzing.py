@@ -13,7 +13,7 @@ from pathlib import Path
 from bench.table import Budget, Row
 
 from dcon.session.head import Head
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

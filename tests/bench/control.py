@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.table import Budget, Row
 
 from dcon.engine import Engine
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.replay import replay
 from dcon.settings import parse
 from dcon.sim.plan import Plan

@@ -28,7 +28,8 @@ from support.swing import Streams
 
 from dcon.sections import Platform
 from dcon.session.codec import Timing
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
+from dcon.settings import Platform
 from pmutools.grid.pmu_model import fleet
 from pmutools.timebase import NS
 

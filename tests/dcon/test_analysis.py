@@ -18,7 +18,7 @@ from dcon.analysis.figures import SHADES, bars, thinned
 from dcon.analysis.report import main_findings
 from dcon.cli import dcon
 from dcon.session.head import Head
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import START_NS, Plan
 from dcon.sim.simulate import simulate

@@ -18,7 +18,7 @@ from support.sessions import PERIOD_NS, T0
 from dcon.limiter import MW_PER_V
 from dcon.session.codec import Timing, Watchdog
 from dcon.session.head import Head
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from dcon.session.export import export
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 

@@ -27,7 +27,7 @@ from dcon.cli import dcon
 from dcon.core.values import InstanceState, Mode, SystemState
 from dcon.drivers.udp_command import CommandOut
 from dcon.limiter import SLEW_MW_PER_S
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.replay import replay
 from pmutools.cli.shell import run
 from pmutools.timebase import NS, format_utc

@@ -11,7 +11,7 @@ from support.sessions import open_session
 
 from dcon.core.register import NO_FLAGS, acknowledged, fallen, latched, open_flags, risen, with_changes
 from dcon.core.values import Event, Flag, Order, Surroundings
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 
 T = 1_700_000_000_000_000_000
 

@@ -28,8 +28,8 @@ from dcon.session.columns import (
 )
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
-from dcon.session.log import LoggedTick, SessionReader
 from dcon.session.parts import Paths
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.rolling import RollingWriter
 from dcon.session.writer import SessionWriter
 from dcon.sim.plan import Plan

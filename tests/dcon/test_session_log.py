@@ -35,7 +35,7 @@ import pmutools
 from dcon.core.values import Inputs, Sample
 from dcon.session.codec import Watchdog
 from dcon.session.encode import tick_entries
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.writer import SessionWriter
 from pmutools.errors import SourceError
 from pmutools.schema.log_writer import LogWriter

@@ -29,8 +29,8 @@ from support.sessions import (
 from dcon.cli import dcon
 from dcon.session.export import export
 from dcon.session.head import Head
-from dcon.session.log import LoggedTick, SessionReader
 from dcon.session.parts import part_path
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.rolling import RETRY_NS, RollingWriter
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

@@ -13,7 +13,7 @@ from dcon.cli import dcon
 from dcon.core.values import Event, Order, Record
 from dcon.session import codec
 from dcon.session.head import Head
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.replay import identical, replay
 from dcon.session.writer import SessionWriter
 from dcon.sim.plan import Plan

@@ -21,7 +21,7 @@ from dcon.core.params import RATES
 from dcon.core.values import Event
 from dcon.limiter import MW_PER_V
 from dcon.session.columns import read_columns
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 from dcon.sim.delays import split
 from dcon.sim.judging import why_unjudged

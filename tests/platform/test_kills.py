@@ -19,7 +19,7 @@ import pytest
 from support.running import PROCESSES, Running
 
 from dcon.drivers.udp_command import CommandOut
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 
 pytestmark = [

@@ -12,7 +12,7 @@ import pytest
 from support.iio import counts, iio_device, volts
 from support.running import Running, command_line, descendants
 
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 
 pytestmark = [

@@ -26,7 +26,7 @@ from dcon.core.values import Event, Order
 from dcon.drivers.udp_command import CommandOut
 from dcon.link.orders import SignedOrder, sign
 from dcon.server.client import Client
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from pmutools.cli.shell import run
 from pmutools.timebase import NS
 

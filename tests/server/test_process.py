@@ -17,7 +17,7 @@ from support.shipped import FakeControl, ServerProcess, eventually, same_ticks
 
 from dcon.link import paths
 from dcon.link.paths import bind_datagram, prepare
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 
 pytestmark = pytest.mark.realtime
 PERIOD_S = 1 / 240

@@ -18,7 +18,7 @@ from dcon.server import state
 from dcon.server.recorder import Recorder
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

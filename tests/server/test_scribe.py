@@ -24,8 +24,8 @@ from dcon.server.client import Client
 from dcon.server.recorder import Recorder, Report
 from dcon.server.scribe import Scribe
 from dcon.server.server import Server
-from dcon.session.log import SessionReader
-from dcon.settings import parse
+from dcon.session.reader import SessionReader
+from dcon.settings import Log, parse
 
 BUNDLE = Bundle(Kind.TICK, 0, 7, tick_at(0).record.tick_ns)
 

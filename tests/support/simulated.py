@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from dcon.engine import Engine
-from dcon.session.log import LoggedTick, SessionReader
+from dcon.session.reader import LoggedTick, SessionReader
 from dcon.settings import parse
 from dcon.sim.plan import START_NS, Plan
 from dcon.sim.simulate import Outcome, simulate

@@ -18,7 +18,7 @@ from dcon.platform.orders import TimedOrder, parse_order
 from dcon.platform.ports import Ends
 from dcon.platform.receiving import Reception
 from dcon.session.head import Head
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 from dcon.session.rolling import RollingWriter
 from pmutools.c37118 import Demux, Loss, Message, StreamConfig
