@@ -5,8 +5,8 @@
 >>> session.pmu["N1"].frequency_hz                    # doctest: +SKIP
 
 The values are those of :class:`~dcon.session.reader.SessionReader`, to the last bit (but for |V1| and its angle, which
-are computed). It takes a quarter of the time, about ten seconds for an hour, and gives no other phasors, no bytes and no
-reasons: an event tells why an instance was disabled.
+are computed). It takes a quarter of the time, about ten seconds for an hour, and gives no other phasors, no bytes and
+no reasons: an event tells why an instance was disabled.
 
 A log may be in parts, cut or damaged: what can be read is there, :attr:`SessionColumns.gaps` says between which ticks
 something is missing. Memory: a batch of chunks, and about 200 MB for an hour of eight PMUs at 60 frames/s.
@@ -14,12 +14,12 @@ something is missing. Memory: a batch of chunks, and about 200 MB for an hour of
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from dcon.session.blocks import Blocks, codes_of, looked_up, named, places
 from dcon.session.codec import Watchdog, decode_flag, decode_order
 from dcon.session.column_tables import (
     INSTANCE_STATES,
@@ -27,8 +27,6 @@ from dcon.session.column_tables import (
     STAMP_SOURCES,
     STATES,
     UNKNOWN,
-    Array,
-    Codes,
     EventRow,
     FlagRow,
     Floats,
@@ -47,22 +45,6 @@ from pmutools.schema.descriptors import message_class, unnamed_fields
 from pmutools.schema.log_reader import LogReader
 from pmutools.schema.pmu_log import name_of
 
-__all__ = [
-    "INSTANCE_STATES",
-    "MODES",
-    "STAMP_SOURCES",
-    "STATES",
-    "TABLES",
-    "UNKNOWN",
-    "EventRow",
-    "FlagRow",
-    "InstanceColumns",
-    "OrderRow",
-    "PmuColumns",
-    "SessionColumns",
-    "TickColumns",
-    "read_columns",
-]
 BATCH_MESSAGES: Final = 50_000
 """Messages that are held as bytes at once; about 20 MB."""
 Batch = dict[tuple[str, str], list[bytes]]
@@ -118,28 +100,6 @@ def _batches(log: LogReader, wanted: Collection[str]) -> Iterator[tuple[Batch, b
     yield batch, log.damage.losses > losses
 
 
-class _Blocks:
-    """Columns under way: a list of blocks each."""
-
-    def __init__(self) -> None:
-        self.blocks: dict[str, list[Array]] = {}
-
-    def add(self, **columns: Array) -> None:
-        for name, column in columns.items():
-            self.blocks.setdefault(name, []).append(column)
-
-    def whole(self, width: int = 0) -> dict[str, Array]:
-        """Each column in one piece; those of two dimensions at least ``width`` wide."""
-        made: dict[str, Array] = {}
-        for name in list(self.blocks):
-            blocks = self.blocks.pop(name)  # and let go of them
-            if blocks[0].ndim == 2:
-                widest = max(width, *(block.shape[1] for block in blocks))
-                blocks = [_padded(block, widest) for block in blocks]
-            made[name] = np.concatenate(blocks)
-        return made
-
-
 class _Builder:
     """Takes messages batch by batch."""
 
@@ -147,9 +107,9 @@ class _Builder:
         self._reader = reader
         self._with_instances = with_instances
         self._ticks = 0
-        self._tick = _Blocks()
-        self._instance = _Blocks()
-        self._pmu: dict[str, _Blocks] = {}
+        self._tick = Blocks()
+        self._instance = Blocks()
+        self._pmu: dict[str, Blocks] = {}
         self._gaps: list[int] = []
         self._incomplete = 0
         self._events: list[EventRow] = []
@@ -189,13 +149,13 @@ class _Builder:
         beside: dict[str, Floats] = {}
         for kind, names in _BESIDE.items():
             _, others = self._columns(kind, batch.get((kind, ""), []), {"tick_ns", *names})
-            at = _places(others["tick_ns"], tick_ns)
+            at = places(others["tick_ns"], tick_ns)
             for field, column in names.items():
-                beside[column] = _looked_up(others[field], at)
+                beside[column] = looked_up(others[field], at)
         self._tick.add(
             tick_ns=tick_ns,
-            state=_codes(of["state"], STATES),
-            mode=_codes(of["mode"], MODES),
+            state=codes_of(of["state"], STATES),
+            mode=codes_of(of["mode"], MODES),
             active=of["active"].astype(np.int16),
             **{name: of[name] for name in _TICK_NUMBERS},
             **beside,
@@ -204,12 +164,12 @@ class _Builder:
 
     def _take_instances(self, tick_ns: Ints, messages: list[bytes]) -> None:
         _, of = self._columns("Instance", messages, {"tick_ns", "state", "delta_f_mhz", "command_mw"})
-        at = _places(of["tick_ns"], tick_ns)
+        at = places(of["tick_ns"], tick_ns)
         self._incomplete += int((at < 0).sum())
         self._instance.add(
-            state=_looked_up(_codes(of["state"], INSTANCE_STATES), at, UNKNOWN),
-            delta_f_mhz=_looked_up(of["delta_f_mhz"], at),
-            command_mw=_looked_up(of["command_mw"], at),
+            state=looked_up(codes_of(of["state"], INSTANCE_STATES), at, UNKNOWN),
+            delta_f_mhz=looked_up(of["delta_f_mhz"], at),
+            command_mw=looked_up(of["command_mw"], at),
         )
 
     def _take_frames(self, name: str, messages: list[bytes]) -> None:
@@ -220,7 +180,7 @@ class _Builder:
                 key: column._replace(codes=column.codes[used]) if isinstance(column, Texts) else column[used]
                 for key, column in of.items()
             }
-        self._pmu.setdefault(name, _Blocks()).add(
+        self._pmu.setdefault(name, Blocks()).add(
             time_ns=of["time_ns"],
             arrival_ns=of["arrival_ns"],
             tick_ns=of["tick_ns"],
@@ -230,7 +190,7 @@ class _Builder:
             rocof_hz_s=of["rocof_hz_s"],
             stat=of["stat"].astype(np.uint16),
             time_quality=of["time_quality"].astype(np.uint8),
-            stamp_source=_codes(of["stamp_source"], STAMP_SOURCES),
+            stamp_source=codes_of(of["stamp_source"], STAMP_SOURCES),
         )
 
     def _columns(self, kind: str, messages: list[bytes], fields: Collection[str]) -> tuple[Ints, dict[str, Any]]:
@@ -261,8 +221,8 @@ class _Builder:
         return SessionColumns(
             metadata=reader.metadata,
             ini_text=reader.ini_text,
-            pmus=_named(reader.pmus, tick["f_hz"].shape[1]),
-            instances=_named(reader.instances, instance["state"].shape[1]),
+            pmus=named(reader.pmus, tick["f_hz"].shape[1]),
+            instances=named(reader.instances, instance["state"].shape[1]),
             flags=reader.flags,
             tick=TickColumns(**tick),
             instance=InstanceColumns(**instance),
@@ -293,41 +253,4 @@ _FRAME_FIELDS = frozenset(
 
 def _watchdog(message: Any) -> Watchdog:
     heartbeats = tuple(zip(message.heartbeat, message.heartbeat_age_ms, strict=False))
-    said = (message.relays_closed, message.estop, message.latched, message.reason)
-    return Watchdog(message.time_ns, *said, heartbeats, message.silent)
-
-
-def _some(column: Any, rows: npt.NDArray[np.bool_]) -> Any:
-    return column._replace(codes=column.codes[rows]) if isinstance(column, Texts) else column[rows]
-
-
-def _codes(texts: Texts, known: Sequence[str]) -> Codes:
-    """Texts as places in ``known``, whatever their shape."""
-    table = [known.index(text) if text in known else UNKNOWN for text in texts.values]
-    return np.array([*table, UNKNOWN], np.uint8)[texts.codes]  # the last stands for -1, too
-
-
-def _places(there_ns: Ints, wanted_ns: Ints) -> Ints:
-    """For each of ``wanted_ns`` its place in ``there_ns``; -1 for none."""
-    if np.array_equal(there_ns, wanted_ns):
-        return np.arange(len(wanted_ns))
-    place = {ns: number for number, ns in enumerate(there_ns.tolist())}
-    return np.array([place.get(ns, -1) for ns in wanted_ns.tolist()], np.int64)
-
-
-def _looked_up(column: Array, at: Ints, unknown: float = np.nan) -> Array:
-    """Rows ``at`` of ``column``; ``unknown`` for -1."""
-    return np.append(column, np.full((1, *column.shape[1:]), unknown, column.dtype), axis=0)[at]
-
-
-def _padded(block: Array, width: int) -> Array:
-    """``block`` (n, m) made ``width`` wide."""
-    if block.shape[1] == width:
-        return block
-    fill = np.nan if block.dtype == np.float64 else UNKNOWN
-    return np.concatenate((block, np.full((len(block), width - block.shape[1]), fill, block.dtype)), axis=1)
-
-
-def _named(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """A log whose head is damaged may name fewer than its ticks hold: number the rest."""
-    return names + tuple(map(str, range(len(names), count)))
+    return Watchdog(message.time_ns, message.relays_closed, message.estop, message.latched, message.reason, heartbeats)

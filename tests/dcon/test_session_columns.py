@@ -17,15 +17,8 @@ from support.virtual_platform import stream, virtual_platform
 from dcon.link.bundle import Entry
 from dcon.session import columns as columns_module
 from dcon.session.codec import Watchdog
-from dcon.session.columns import (
-    INSTANCE_STATES,
-    MODES,
-    STAMP_SOURCES,
-    STATES,
-    UNKNOWN,
-    SessionColumns,
-    read_columns,
-)
+from dcon.session.column_tables import INSTANCE_STATES, MODES, STAMP_SOURCES, STATES, UNKNOWN, SessionColumns
+from dcon.session.columns import read_columns
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.parts import Paths
