@@ -12,12 +12,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from dcon.core.values import NOTHING, Order, Record, Surroundings
+from dcon.core.values import Order
 from dcon.drivers.udp_command import CommandOut, encode
-from dcon.frontend import Reading
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.beats import LoopName
+from dcon.link.bundle import Entry
 from dcon.link.crossing import Counts, Failure, Item, decode
 from dcon.link.paths import Sender
 from dcon.link.shipper import Ring, Shipper
@@ -26,8 +26,8 @@ from dcon.platform.children import Children
 from dcon.platform.news import Heard, hear, is_there, surroundings, watchdog_of
 from dcon.platform.ports import Ends, Told
 from dcon.platform.pulse import Pulse
-from dcon.session.codec import Timing, Watchdog
-from dcon.session.encode import tick_entries, watchdog_entry
+from dcon.session.codec import Watchdog
+from dcon.session.encode import watchdog_entry
 from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.clock import Clock
@@ -155,7 +155,6 @@ class ShippedLog:
         session = random.getrandbits(32)  # tells this session from the one before, to a server that was there
         limits = settings.log
         ring = Ring(round(limits.backfill_s * 1e9), round(limits.backfill_mb * 1e6))
-        self._instances = head.instances
         self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
         self._news, self._clock = news, clock
         self._shown: Watchdog | None = None
@@ -164,22 +163,12 @@ class ShippedLog:
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
 
-    def tick(
-        self,
-        record: Record,
-        readings: Iterable[Reading],
-        orders: Iterable[Order],
-        *,
-        timing: Timing | None = None,
-        surroundings: Surroundings = NOTHING,
-    ) -> None:
-        entries = tick_entries(self._instances, record, readings, orders, timing=timing, surroundings=surroundings)
-        now_ns = self._clock.monotonic_ns()
-        watchdog = watchdog_of(self._news.heard, record.tick_ns, now_ns)
-        if watchdog is not None and self._is_due(watchdog):
-            entries.append(watchdog_entry(watchdog))
+    def write(self, entries: Sequence[Entry], tick_ns: int) -> None:
+        if (watchdog := watchdog_of(self._news.heard, tick_ns)) is not None and self._is_due(watchdog):
+            entries = (*entries, watchdog_entry(watchdog))
             self._shown = watchdog
-        self._shipping.shipper.tick(record.tick_ns, entries, now_ns)
+        now_ns = self._clock.monotonic_ns()
+        self._shipping.shipper.tick(tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
         self._ticks += 1
 

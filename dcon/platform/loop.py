@@ -28,6 +28,7 @@ from dcon.platform.ports import Ends, Log, Told
 from dcon.platform.schedule import TickGrid
 from dcon.platform.waiting import Waiting
 from dcon.session.codec import Timing
+from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.c37118 import Frame, decode_config
@@ -225,7 +226,9 @@ class Platform:
         configs, self._configs = self._configs, []
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
-        log.tick(tick.record, tick.readings, orders, timing=timing, surroundings=tick.surroundings)
+        names, record = self.settings.params.instance_names, tick.record
+        entries = tick_entries(names, record, tick.readings, orders, timing=timing, surroundings=tick.surroundings)
+        log.write(entries, record.tick_ns)
 
     def _take(self, items: Sequence[Item]) -> None:
         sites = self.settings.sites

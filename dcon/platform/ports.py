@@ -7,14 +7,13 @@ run folder they are the sockets of other processes (:mod:`dcon.platform.linked`)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from dcon.core.values import NOTHING, Order, Record, Surroundings
-from dcon.frontend import Reading
+from dcon.core.values import NOTHING, Order, Surroundings
+from dcon.link.bundle import Entry
 from dcon.link.crossing import Counts, Item
-from dcon.session.codec import Timing
 from dcon.session.head import Head
 
 
@@ -72,16 +71,8 @@ class Log(Protocol):
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """A configuration frame that came at ``time_ns``."""
 
-    def tick(
-        self,
-        record: Record,
-        readings: Iterable[Reading],
-        orders: Iterable[Order],
-        *,
-        timing: Timing | None = None,
-        surroundings: Surroundings = NOTHING,
-    ) -> None:
-        """What a tick was given and has decided."""
+    def write(self, entries: Sequence[Entry], tick_ns: int) -> None:
+        """What the tick at ``tick_ns`` was given and has decided (:func:`~dcon.session.encode.tick_entries`)."""
 
     def close(self) -> None:
         """All ticks have been logged; the one call that may take its time."""

@@ -11,21 +11,18 @@ import contextlib
 import logging
 import os
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from dcon.core.values import NOTHING, Event, Order, Pdci, Record, Surroundings
+from dcon.core.values import Event
 from dcon.link.bundle import Entry
 from dcon.session import codec
-from dcon.session.codec import Timing, Watchdog
-from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.parts import SESSION, part_path
 from dcon.session.writer import SessionWriter
 from pmutools.errors import SourceError
-from pmutools.schema.pmu_log import Loggable
 from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
@@ -44,8 +41,8 @@ class RollingWriter:
     ----------
     path
         Of the first part.
-    head, configs
-        As for :class:`SessionWriter`; they go into every part, with the newest configurations.
+    head
+        As for :class:`SessionWriter`; it goes into every part, with the newest configurations.
     max_mb, max_minutes
         A part that has so many bytes (in millions, compressed) or spans so much of the ticks' time is ended, between
         two ticks; infinity for no limit.
@@ -61,7 +58,6 @@ class RollingWriter:
         self,
         path: str | os.PathLike[str],
         head: Head,
-        configs: Mapping[str, bytes] | None = None,
         *,
         max_mb: float = float("inf"),
         max_minutes: float = float("inf"),
@@ -77,7 +73,7 @@ class RollingWriter:
         self._max_bytes = max_mb * 1e6
         self._max_ns = max_minutes * 60 * NS
         self._head = replace(head, metadata={**head.metadata, SESSION: session_id or uuid.uuid4().hex})
-        self._configs = {name: (frame, 0) for name, frame in (configs or {}).items()}
+        self._configs: dict[str, tuple[bytes, int]] = {}
         self._log: SessionWriter | None = None
         self._begun_ns = 0
         """First tick of the part."""
@@ -91,44 +87,29 @@ class RollingWriter:
         if not patient:
             self._open()
 
-    def tick(
-        self,
-        record: Record,
-        frames: Iterable[Loggable] = (),
-        orders: Iterable[Order] = (),
-        *,
-        timing: Timing | None = None,
-        pdci: Pdci | None = None,
-        surroundings: Surroundings = NOTHING,
-    ) -> None:
-        """Log one tick, as :meth:`SessionWriter.tick` does; or count it."""
-        instances = self._head.instances
-        entries = tick_entries(instances, record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
-        self.write(entries, record.tick_ns)
-
-    def write(self, entries: Sequence[Entry], now_ns: int) -> None:
-        """Log the entries of the tick at ``now_ns``, or count it."""
-        log = self._log or self._next_part(now_ns)
+    def write(self, entries: Sequence[Entry], tick_ns: int) -> None:
+        """Log the entries of the tick at ``tick_ns``, or count it."""
+        log = self._log or self._next_part(tick_ns)
         if log is None:
             self._count(1)
             return
         if self._missing and not self._written:
             gap = Event("log_gap", LOG_SUBJECT, f"{self._missing} ticks were not logged: {self._reason}")
-            entries = (*entries, Entry("Event", "", codec.encode_event(now_ns, gap), now_ns, now_ns))
+            entries = (*entries, Entry("Event", "", codec.encode_event(tick_ns, gap), tick_ns, tick_ns))
         size = log.size
         try:
-            log.write(entries, now_ns)
+            log.write(entries, tick_ns)
         except SourceError as error:
-            self._refused(error, now_ns, self._open_ticks + 1)
+            self._refused(error, tick_ns, self._open_ticks + 1)
             return
         if log.size != size:
             self._flushed()
         if not self._written:
-            self._begun_ns = now_ns
+            self._begun_ns = tick_ns
         self._written += 1
         self._open_ticks += 1
-        if log.size >= self._max_bytes or abs(now_ns - self._begun_ns) >= self._max_ns:
-            self._end_part(log, now_ns)  # the next is begun with the next tick: one piece of work at a time
+        if log.size >= self._max_bytes or abs(tick_ns - self._begun_ns) >= self._max_ns:
+            self._end_part(log, tick_ns)  # the next is begun with the next tick: one piece of work at a time
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """Attach a configuration frame that came at ``time_ns``; parts to come begin with it."""
@@ -139,15 +120,6 @@ class RollingWriter:
                 self._flushed()
             except SourceError as error:
                 self._refused(error, time_ns, self._open_ticks)
-
-    def watchdog(self, watchdog: Watchdog) -> None:
-        """Log the watchdog's state; where nothing can be logged, it is not."""
-        log = self._log or self._next_part(watchdog.time_ns)
-        if log is not None:
-            try:
-                log.watchdog(watchdog)
-            except SourceError as error:
-                self._refused(error, watchdog.time_ns, self._open_ticks)
 
     def lost(self, ticks: int, reason: str, now_ns: int) -> None:
         """``ticks`` will not come: what is logged next begins a part that says so."""

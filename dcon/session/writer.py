@@ -11,15 +11,12 @@ from types import TracebackType
 from typing import IO
 
 import pmutools
-from dcon.core.values import NOTHING, Order, Pdci, Record, Surroundings
 from dcon.link.bundle import Entry
-from dcon.session.codec import Timing, Watchdog
-from dcon.session.encode import tick_entries, watchdog_entry
 from dcon.session.head import INI_NAME, PROBE_NAME, Head
 from dcon.session.parts import SESSION
 from pmutools.schema.log_writer import LogWriter
 from pmutools.schema.messages import MESSAGES
-from pmutools.schema.pmu_log import Loggable, PmuTopics
+from pmutools.schema.pmu_log import PmuTopics
 
 
 class SessionWriter:
@@ -38,7 +35,6 @@ class SessionWriter:
     def __init__(
         self, target: str | os.PathLike[str] | IO[bytes], head: Head, configs: Mapping[str, bytes] | None = None
     ) -> None:
-        self.head = head
         self._tick_ns: int | None = None
         self._log = LogWriter(target)
         self._pmus = PmuTopics(self._log)
@@ -53,21 +49,6 @@ class SessionWriter:
             for name, message in MESSAGES.items()
             if message.topic.startswith("/dcon/")
         }
-
-    def tick(
-        self,
-        record: Record,
-        frames: Iterable[Loggable] = (),
-        orders: Iterable[Order] = (),
-        *,
-        timing: Timing | None = None,
-        pdci: Pdci | None = None,
-        surroundings: Surroundings = NOTHING,
-    ) -> None:
-        """Log one tick, as :func:`~dcon.session.encode.tick_entries` takes it."""
-        instances = self.head.instances
-        entries = tick_entries(instances, record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
-        self.write(entries, record.tick_ns)
 
     def write(self, entries: Iterable[Entry], tick_ns: int) -> None:
         """Log entries of the tick at ``tick_ns``: all of them, or some, and more with the same ``tick_ns``."""
@@ -89,9 +70,6 @@ class SessionWriter:
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """Attach a configuration frame that came at ``time_ns``."""
         self._pmus.config(name, frame, time_ns)
-
-    def watchdog(self, watchdog: Watchdog) -> None:
-        self.write((watchdog_entry(watchdog),), watchdog.time_ns)
 
     def flush(self) -> None:
         """A process killed after this loses nothing that was logged before it."""

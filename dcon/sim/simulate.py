@@ -15,6 +15,7 @@ from dcon.core.rows import CORE
 from dcon.core.values import Event, Mode, Pdci, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
+from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.writer import SessionWriter
 from dcon.settings import Settings, parse
@@ -179,6 +180,7 @@ def _run(
     probe_s = split.start_s if split.section else None
     operator = EagerOperator(Mode.CLOSED_LOOP if plan.control else Mode.OPEN_LOOP, probe_s)
     operated = plan.control or probe_s is not None
+    names = engine.params.instance_names
     arrivals: list[Arrival] = []
     order = 0
     end_ns = START_NS + round(plan.length_s * timebase.NS)
@@ -198,7 +200,8 @@ def _run(
         if tell is not None and number % TOLD_TICKS == 0:
             tell(outcome.tick_s[-1])
         if log is not None:
-            log.tick(tick.record, tick.readings, orders, pdci=_line(grid, tick_ns), surroundings=tick.surroundings)
+            line, around = _line(grid, tick_ns), tick.surroundings
+            log.write(tick_entries(names, tick.record, tick.readings, orders, pdci=line, surroundings=around), tick_ns)
 
 
 def _arrived(

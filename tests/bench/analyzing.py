@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.table import Budget, Row
+from support.sessions import log_configs, log_tick
 
 from dcon.session.head import Head
 from dcon.session.reader import LoggedTick, SessionReader
@@ -56,11 +57,19 @@ def write(path: Path, sizes: Sizes) -> int:
     ticks = list(reader.ticks())
     whole_ns = round(sizes.simulated_s) * 10**9
     head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags, reader.metadata)
-    with RollingWriter(path, head, reader.configs) as log:
+    with RollingWriter(path, head) as log:
+        log_configs(log, reader.configs)
         for number in range(sizes.times):
             for tick in ticks:
                 later = shifted(tick, number * whole_ns)
-                log.tick(later.record, later.frames, later.orders, surroundings=later.surroundings)
+                log_tick(
+                    log,
+                    later.record,
+                    later.frames,
+                    later.orders,
+                    surroundings=later.surroundings,
+                    instances=reader.instances,
+                )
     return len(ticks) * sizes.times
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.sessions import log_configs, log_tick
 
 from dcon.analysis.analysis import analyze, analyze_all
 from dcon.analysis.course import Stretch
@@ -168,9 +169,10 @@ def test_frames_lost_and_doubled_are_counted(tmp_path: Path) -> None:
 def test_a_session_in_parts_is_one(closed: Path, tmp_path: Path) -> None:
     reader = SessionReader(closed)
     head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags)
-    with RollingWriter(tmp_path / "s.mcap", head, reader.configs, max_minutes=0.2) as log:
+    with RollingWriter(tmp_path / "s.mcap", head, max_minutes=0.2) as log:
+        log_configs(log, reader.configs)
         for tick in reader.ticks():
-            log.tick(tick.record, tick.frames, tick.orders)
+            log_tick(log, tick.record, tick.frames, tick.orders, instances=reader.instances)
     assert len(log.parts) == 3
     whole, parted = analyze([closed]), analyze_all(log.parts)
     (session,) = parted.sessions

@@ -13,7 +13,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorS
 from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory
-from support.sessions import PERIOD_NS, T0
+from support.sessions import log_configs, log_tick, log_watchdog
 
 from dcon.limiter import MW_PER_V
 from dcon.session.codec import Timing, Watchdog
@@ -38,11 +38,20 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     reader = SessionReader(folder / "simulated.mcap")
     names = {"pmus": reader.pmus, "instances": reader.instances, "flags": reader.flags}
     head = Head(reader.ini_text, **names)
-    with RollingWriter(folder / "live.mcap", head, reader.configs, max_minutes=1 / 60) as log:
+    with RollingWriter(folder / "live.mcap", head, max_minutes=1 / 60) as log:
+        log_configs(log, reader.configs)
         for number, tick in enumerate(reader.ticks()):
             if number % 60 == 0:
-                log.watchdog(Watchdog(T0 + number * PERIOD_NS, True, heartbeats=(("control", 1.0),)))
-            log.tick(tick.record, tick.frames, tick.orders, timing=Timing(200.0, 50.0), pdci=tick.pdci)
+                log_watchdog(log, Watchdog(tick.record.tick_ns, True, heartbeats=(("control", 1.0),)))
+            log_tick(
+                log,
+                tick.record,
+                tick.frames,
+                tick.orders,
+                timing=Timing(200.0, 50.0),
+                pdci=tick.pdci,
+                instances=reader.instances,
+            )
     return [folder / "simulated.mcap", *log.parts]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.rig import Rig, Signal, steady
-from support.sessions import open_session
+from support.sessions import log_tick, open_session
 
 from dcon.core.register import NO_FLAGS, acknowledged, fallen, latched, open_flags, risen, with_changes
 from dcon.core.values import Event, Flag, Order, Surroundings
@@ -110,7 +110,7 @@ def test_changes_are_logged_and_read_back(tmp_path: Path) -> None:
     high = Rig(steady(N1=Signal(pu=lambda k: 1.25 if k >= 20 else 1.0))).run(40)
     with open_session(path) as log:
         for record in high.records:
-            log.tick(record)
+            log_tick(log, record)
     back = [tick.record.flag_changes for tick in SessionReader(path).ticks()]
     assert repr(back) == repr([record.flag_changes for record in high.records])
     assert any(not math.isnan(flag.value) for changes in back for flag in changes)

@@ -11,7 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.sessions import INSTANCES, PMUS, T0, bits, open_session, random_ticks, write_session
+from support.sessions import (
+    INSTANCES,
+    PMUS,
+    T0,
+    bits,
+    log_tick,
+    log_watchdog,
+    open_session,
+    random_ticks,
+    write_session,
+)
 from support.virtual_platform import stream, virtual_platform
 
 from dcon.link.bundle import Entry
@@ -131,7 +141,7 @@ def test_a_session_in_parts(tmp_path: Path) -> None:
     names = {"pmus": PMUS, "instances": INSTANCES}
     with RollingWriter(path, Head("", **names), max_minutes=1 / 40) as log:
         for tick in ticks:
-            log.tick(tick.record, tick.frames, tick.orders)
+            log_tick(log, tick.record, tick.frames, tick.orders)
     assert len(log.parts) == 4
     session, back = compare(path)
     assert len(back) == 300 and session.gaps == []
@@ -187,7 +197,7 @@ def test_ticks_that_are_not_whole(tmp_path: Path) -> None:
                 alone = [entry for entry in tick_entries(INSTANCES, tick.record) if entry.message == "Tick"]
                 log.write(alone, tick.record.tick_ns)
             else:
-                log.tick(tick.record)
+                log_tick(log, tick.record)
     session = read_columns(tmp_path / "s.mcap")
     assert len(session.tick.tick_ns) == 20 and session.incomplete_ticks == 4
     assert (session.instance.state[3::5] == UNKNOWN).all() and np.isnan(session.instance.command_mw[3::5]).all()
@@ -203,7 +213,7 @@ def test_states_of_a_newer_version_and_messages_that_are_none(tmp_path: Path) ->
                 record = record._replace(state="HIBERNATING")
             if number == 9:
                 log.write([Entry("Tick", "", b"\xff\xff", record.tick_ns, record.tick_ns)], record.tick_ns)
-            log.tick(record)
+            log_tick(log, record)
     session = read_columns(tmp_path / "s.mcap")
     assert session.tick.state[7] == UNKNOWN and (session.tick.state[8:] != UNKNOWN).all()
     assert len(session.tick.tick_ns) == 30
@@ -213,8 +223,8 @@ def test_states_of_a_newer_version_and_messages_that_are_none(tmp_path: Path) ->
 def test_the_watchdog(tmp_path: Path) -> None:
     seen = Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5), ("udp", 1.0)))
     with open_session(tmp_path / "s.mcap") as log:
-        log.watchdog(seen)
-        log.tick(random_ticks(1)[0].record)
+        log_watchdog(log, seen)
+        log_tick(log, random_ticks(1)[0].record)
     assert read_columns(tmp_path / "s.mcap").watchdog == [seen]
 
 
@@ -255,7 +265,7 @@ def test_memory_is_that_of_the_columns_and_a_batch(
         for number in range(1500):
             tick = ticks[number % len(ticks)]
             record = tick.record._replace(tick_ns=T0 + number * 16_666_667, events=())
-            log.tick(record, tick.frames)
+            log_tick(log, record, tick.frames, instances=reader.instances)
     read_columns(simulated)  # what is imported
     tracemalloc.start()
     try:

@@ -21,6 +21,8 @@ from support.sessions import (
     T0,
     Tick,
     bits,
+    log_tick,
+    log_watchdog,
     open_session,
     random_ticks,
     write_session,
@@ -225,9 +227,9 @@ def test_messages_as_they_are(session: Path, tmp_path: Path) -> None:
 
 def test_the_watchdogs_table(tmp_path: Path) -> None:
     with open_session(tmp_path / "s.mcap") as log:
-        log.watchdog(Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5), ("udp", 1.0))))
-        log.tick(TICKS[0].record)
-        log.watchdog(Watchdog(T0 + 5, True))
+        log_watchdog(log, Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5), ("udp", 1.0))))
+        log_tick(log, TICKS[0].record)
+        log_watchdog(log, Watchdog(T0 + 5, True))
     assert export(tmp_path / "s.mcap", tmp_path / "w.jsonl", "watchdog").rows == 2
     first, last = map(json.loads, (tmp_path / "w.jsonl").read_text().splitlines())
     assert first == {

@@ -25,6 +25,8 @@ from support.sessions import (
     PMUS,
     T0,
     bits,
+    log_tick,
+    log_watchdog,
     open_session,
     random_ticks,
     write_session,
@@ -89,10 +91,10 @@ def test_frames_that_no_tick_consumed_are_not_inputs(tmp_path: Path) -> None:
     ticks = random_ticks(2)
     path = tmp_path / "s.mcap"
     with open_session(path) as session:
-        session.tick(ticks[0].record, ticks[0].frames)
+        log_tick(session, ticks[0].record, ticks[0].frames)
         stray = PmuFrame("N9", b"", T0, T0, ticks[0].frames[0].stamp_source, 0, 0, 60.0)
         session._pmus.write(stray)
-        session.tick(ticks[1].record, ticks[1].frames)
+        log_tick(session, ticks[1].record, ticks[1].frames)
     assert [len(tick.frames) for tick in SessionReader(path).ticks()] == [len(tick.frames) for tick in ticks]
 
 
@@ -103,7 +105,7 @@ def test_every_topic_is_decoded_by_any_mcap_reader(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     ticks = random_ticks(200)
     with open_session(path) as session:
-        session.watchdog(Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5),)))
+        log_watchdog(session, Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5),)))
         for tick in ticks:
             write_tick(session, tick)
     seen: dict[str, int] = {}
@@ -216,10 +218,10 @@ def test_a_tick_of_which_a_part_is_missing_is_counted_and_left_out(tmp_path: Pat
     ticks = random_ticks(3)
     path = tmp_path / "s.mcap"
     with open_session(path) as session:
-        session.tick(ticks[0].record)
+        log_tick(session, ticks[0].record)
         whole = tick_entries(INSTANCES, ticks[1].record)
         session.write([entry for entry in whole if entry.message == "Tick"], ticks[1].record.tick_ns)
-        session.tick(ticks[2].record)
+        log_tick(session, ticks[2].record)
     reader = SessionReader(path)
     assert [(tick.record.tick_ns, tick.after_loss) for tick in reader.ticks()] == [
         (T0, False),
@@ -232,7 +234,7 @@ def test_a_state_of_a_newer_version_is_counted_and_left_out(tmp_path: Path) -> N
     record = random_ticks(1)[0].record
     path = tmp_path / "s.mcap"
     with open_session(path) as session:
-        session.tick(record._replace(state="HIBERNATING"))  # type: ignore[arg-type]
+        log_tick(session, record._replace(state="HIBERNATING"))  # type: ignore[arg-type]
     reader = SessionReader(path)
     assert list(reader.ticks()) == []
     assert reader.incomplete_ticks == 1
@@ -260,10 +262,10 @@ def test_a_configuration_that_comes_later(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     with open_session(path) as session:
         for tick in ticks[:2]:
-            session.tick(tick.record, tick.frames)
+            log_tick(session, tick.record, tick.frames)
         session.config("N1", b"\xaa\x31 new", ticks[2].record.tick_ns)
         for tick in ticks[2:]:
-            session.tick(tick.record, tick.frames)
+            log_tick(session, tick.record, tick.frames)
     reader = SessionReader(path)
     assert reader.configs["N1"] == CONFIGS["N1"]
     assert [tick.record.tick_ns for tick in reader.ticks()] == [tick.record.tick_ns for tick in ticks]
@@ -271,7 +273,7 @@ def test_a_configuration_that_comes_later(tmp_path: Path) -> None:
 
 def test_a_tick_before_1970_is_our_callers_mistake(tmp_path: Path) -> None:
     with open_session(tmp_path / "s.mcap") as session, pytest.raises(ValueError, match="tick_ns is 0"):
-        session.tick(random_ticks(1)[0].record._replace(tick_ns=0))
+        log_tick(session, random_ticks(1)[0].record._replace(tick_ns=0))
 
 
 class FullDisk(io.BytesIO):
@@ -287,7 +289,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_flushed(tmp_path: Path) -> 
     session = SessionWriter(disk, HEAD, CONFIGS)
     with pytest.raises(SourceError, match="cannot write: No space left on device"), session:
         for tick in ticks:
-            session.tick(tick.record, tick.frames)
+            log_tick(session, tick.record, tick.frames)
     path = tmp_path / "s.mcap"
     path.write_bytes(disk.getvalue())
     reader = SessionReader(path)

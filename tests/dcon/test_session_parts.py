@@ -22,6 +22,8 @@ from support.sessions import (
     T0,
     Tick,
     bits,
+    log_configs,
+    log_tick,
     random_ticks,
     write_session,
 )
@@ -42,13 +44,15 @@ TICKS = random_ticks(400)
 
 
 def rolling(path: Path, **limits: Any) -> RollingWriter:
-    return RollingWriter(path, HEAD, CONFIGS, **limits)
+    log = RollingWriter(path, HEAD, **limits)
+    log_configs(log, CONFIGS)
+    return log
 
 
 def written(path: Path, ticks: list[Tick] = TICKS, **limits: Any) -> RollingWriter:
     with rolling(path, **limits) as log:
         for tick in ticks:
-            log.tick(tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
+            log_tick(log, tick.record, tick.frames, tick.orders, timing=tick.timing, pdci=tick.pdci)
     return log
 
 
@@ -91,7 +95,7 @@ def test_the_newest_configuration_goes_into_every_part(tmp_path: Path) -> None:
         for number, tick in enumerate(TICKS):
             if number == 100:
                 log.config("N1", b"\xaa\x31 new", tick.record.tick_ns)
-            log.tick(tick.record, tick.frames)
+            log_tick(log, tick.record, tick.frames)
     assert SessionReader([log.parts[1]]).configs["N1"] == CONFIGS["N1"]
     assert SessionReader([log.parts[2]]).configs == {**CONFIGS, "N1": b"\xaa\x31 new"}
     assert len(stamps(SessionReader(log.parts[0]))) == 400
@@ -185,7 +189,7 @@ def test_a_full_disk_is_waited_for_and_told(
                 disk.capacity = disk.used + 1000
             if number == 1300:
                 disk.capacity = float("inf")
-            log.tick(tick.record, tick.frames, tick.orders, timing=tick.timing)
+            log_tick(log, tick.record, tick.frames, tick.orders, timing=tick.timing)
     assert [path.name for path in log.parts] == ["s.mcap", "s.part2.mcap"] == sorted(p.name for p in tmp_path.iterdir())
     reader = SessionReader(log.path)
     back = list(reader.ticks())
@@ -212,7 +216,7 @@ def test_a_disk_that_stays_full_leaves_one_file_and_a_count(tmp_path: Path, monk
         for number, tick in enumerate(random_ticks(1500)):
             if number == 300:
                 disk.capacity = disk.used + 9000  # enough for the head of a part, not for a chunk
-            log.tick(tick.record, tick.frames)
+            log_tick(log, tick.record, tick.frames)
     assert [path.name for path in tmp_path.iterdir()] == ["s.mcap"] == [path.name for path in log.parts]
     back = stamps(SessionReader(log.path))
     assert len(back) + log.unlogged_ticks == 1500 and 250 <= len(back) <= 310
@@ -227,11 +231,11 @@ def test_wherever_the_disk_is_full_every_tick_is_logged_or_counted(
     with rolling(tmp_path / "s.mcap", max_minutes=1 / 60) as log:
         disk.capacity = disk.used + room
         for tick in TICKS[:200]:
-            log.tick(tick.record, tick.frames)
+            log_tick(log, tick.record, tick.frames)
         disk.capacity = float("inf")
         late = [replace_time(tick, 2 * RETRY_NS) for tick in TICKS[200:210]]
         for tick in late:
-            log.tick(tick.record)
+            log_tick(log, tick.record)
     reader = SessionReader(log.path)
     back = list(reader.ticks())
     assert len(back) + log.unlogged_ticks == 210
@@ -256,14 +260,10 @@ def session(tmp_path: Path) -> list[Path]:
     names = ("pmus", "instances", "flags")
     metadata = {key: value for key, value in reader.metadata.items() if key not in names}
     head = Head(reader.ini_text, reader.pmus, reader.instances, reader.flags, metadata)
-    with RollingWriter(
-        tmp_path / "s.mcap",
-        head,
-        reader.configs,
-        max_minutes=1 / 30,
-    ) as log:
+    with RollingWriter(tmp_path / "s.mcap", head, max_minutes=1 / 30) as log:
+        log_configs(log, reader.configs)
         for tick in reader.ticks():
-            log.tick(tick.record, tick.frames, tick.orders)
+            log_tick(log, tick.record, tick.frames, tick.orders, instances=reader.instances)
     assert len(log.parts) == 4
     return log.parts
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.sessions import log_tick
 
 from dcon.cli import dcon
 from dcon.core.values import Event, Order, Record
@@ -47,7 +48,9 @@ def rewritten(session: Path, out: Path, edit: Edit = lambda tick: tick, ini: str
     with SessionWriter(out, head, reader.configs) as log:
         for number, tick in enumerate(reader.ticks()):
             changed = edit(tick) if number == EDITED else tick
-            log.tick(changed.record, changed.frames, changed.orders, timing=changed.timing)
+            log_tick(
+                log, changed.record, changed.frames, changed.orders, timing=changed.timing, instances=reader.instances
+            )
     return out
 
 
@@ -388,6 +391,6 @@ def test_a_damaged_configuration_is_a_problem_that_is_told(session: Path, tmp_pa
     head = Head(reader.ini_text, reader.pmus, reader.instances, metadata={"verified": "true"})
     with SessionWriter(path, head, configs) as log:
         for tick in list(reader.ticks())[:30]:
-            log.tick(tick.record, tick.frames, tick.orders)
+            log_tick(log, tick.record, tick.frames, tick.orders, instances=reader.instances)
     code, _, err = told(capsys, str(path))
     assert code == 3 and "N1: CHK is" in err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import struct
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,11 +22,13 @@ from dcon.core.values import (
     Surroundings,
     SystemState,
 )
-from dcon.session.codec import Timing
+from dcon.session.codec import Timing, Watchdog
+from dcon.session.encode import tick_entries, watchdog_entry
 from dcon.session.head import Head
+from dcon.session.rolling import RollingWriter
 from dcon.session.writer import SessionWriter
 from pmutools.flow import StampSource
-from pmutools.schema.pmu_log import PmuFrame
+from pmutools.schema.pmu_log import Loggable, PmuFrame
 
 PMUS = ("N1", "N2", "S1", "S2")
 INSTANCES = ("N1-S1", "N1-S2", "N2-S1", "N2-S2")
@@ -39,7 +42,7 @@ PERIOD_NS = 16_666_667
 
 
 class Tick(NamedTuple):
-    """What goes to :meth:`SessionWriter.tick`."""
+    """What :func:`log_tick` logs."""
 
     record: Record
     frames: tuple[PmuFrame, ...]
@@ -63,12 +66,33 @@ def write_session(path: Path, ticks: list[Tick]) -> Path:
 
 
 def write_tick(session: SessionWriter, tick: Tick) -> None:
-    session.tick(
-        *(tick.record, tick.frames, tick.orders),
-        timing=tick.timing,
-        pdci=tick.pdci,
-        surroundings=tick.surroundings,
-    )
+    log_tick(session, *tick[:3], timing=tick.timing, pdci=tick.pdci, surroundings=tick.surroundings)
+
+
+def log_tick(
+    log: SessionWriter | RollingWriter,
+    record: Record,
+    frames: Iterable[Loggable] = (),
+    orders: Iterable[Order] = (),
+    *,
+    instances: Sequence[str] = INSTANCES,
+    timing: Timing | None = None,
+    pdci: Pdci | None = None,
+    surroundings: Surroundings = NOTHING,
+) -> None:
+    """Log one tick, as a controller with these ``instances`` does."""
+    entries = tick_entries(instances, record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
+    log.write(entries, record.tick_ns)
+
+
+def log_watchdog(log: SessionWriter | RollingWriter, watchdog: Watchdog) -> None:
+    log.write([watchdog_entry(watchdog)], watchdog.time_ns)
+
+
+def log_configs(log: RollingWriter, configs: Mapping[str, bytes]) -> None:
+    """What came before the first tick."""
+    for name, frame in configs.items():
+        log.config(name, frame, 0)
 
 
 def open_session(path: Path) -> SessionWriter:
