@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import stat
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
@@ -77,6 +78,8 @@ class RollingWriter:
         self._log: SessionWriter | None = None
         self._begun_ns = 0
         """First tick of the part."""
+        self._is_made = False
+        """The part was not there before: it is ours to take away."""
         self._written = self._open_ticks = 0
         """Ticks of the part; those of them that are not flushed yet."""
         self._tried_ns: int | None = None
@@ -184,6 +187,7 @@ class RollingWriter:
         if self.parts:
             head |= {"continues": self.parts[-1].name, "first": self.parts[0].name}
         self.parts.append(part_path(self.path, number))
+        self._is_made = not os.path.lexists(self.parts[-1])
         self._written = self._open_ticks = 0
         metadata = {**self._head.metadata, **head}
         self._log = SessionWriter(self.parts[-1], replace(self._head, metadata=metadata))
@@ -208,8 +212,10 @@ class RollingWriter:
         self._tried_ns = now_ns
         self._log = None
         if self._written == self._open_ticks:  # a part that holds nothing gives its room and its number back
+            path = self.parts.pop()
             with contextlib.suppress(OSError):
-                self.parts.pop().unlink()
+                if self._is_made and stat.S_ISREG(path.lstat().st_mode):
+                    path.unlink()
 
     def _count(self, ticks: int) -> None:
         self._missing += ticks

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import stat
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -250,6 +252,31 @@ def replace_time(tick: Tick, by_ns: int) -> Tick:
 def test_only_the_first_part_may_fail(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="No such file or directory"):
         rolling(tmp_path / "no" / "s.mcap")
+
+
+def test_what_is_no_file_is_never_taken_away(tmp_path: Path) -> None:
+    """A FIFO whose reader goes, for a device."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    with RollingWriter(fifo, HEAD, patient=True) as log:
+        log_tick(log, TICKS[0].record)
+        os.close(reader)
+        log.flush(T0)
+        assert log.is_refused and log.unlogged_ticks == 1 and log.parts == []
+    assert stat.S_ISFIFO(fifo.lstat().st_mode)
+
+
+def test_a_file_that_was_there_before_stays_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "s.mcap").write_bytes(b"")
+    full_disk(tmp_path, monkeypatch, 100)
+    with RollingWriter(tmp_path / "s.mcap", HEAD, patient=True) as log:
+        log_tick(log, TICKS[0].record)
+        assert log.is_refused
+    with RollingWriter(tmp_path / "new.mcap", HEAD, patient=True) as log:
+        log_tick(log, TICKS[0].record)
+        assert log.is_refused
+    assert [path.name for path in tmp_path.iterdir()] == ["s.mcap"]
 
 
 @pytest.fixture
