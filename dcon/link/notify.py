@@ -29,7 +29,3 @@ class Notifier:
         except OSError:
             return False
         return True
-
-    def close(self) -> None:
-        if self._sock is not None:
-            self._sock.close()

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
 from dcon.link.beats import Verb, encode_word
-from dcon.link.orders import LONGEST, Operator, SignedOrder, Verifier
+from dcon.link.orders import LONGEST, SignedOrder, Verifier
 from dcon.link.paths import AIDE, WATCHDOG, Sender
 from dcon.server.newest import News
 from dcon.server.pending import Answer, Pending
@@ -27,12 +27,9 @@ VERBS = {"estop": Verb.ESTOP, "release": Verb.ESTOP_RELEASE, "reset": Verb.RESET
 class Desk:
     """Answers asks. An ask's answer comes at once, or (None) from :meth:`heard`, :meth:`reply` or :meth:`expired`."""
 
-    def __init__(
-        self, folder: Path, operators: Mapping[str, Operator], status: Callable[[], dict[str, Any]], verifier: Verifier
-    ) -> None:
-        """``verifier`` is asked before the watchdog is told; ``operators`` may be none: then nobody orders anything."""
+    def __init__(self, folder: Path, status: Callable[[], dict[str, Any]], verifier: Verifier) -> None:
+        """``verifier`` is asked before the watchdog is told; where it knows no operators, nobody orders anything."""
         self._status = status
-        self._operators = operators
         self._verifier = verifier
         self._folder = folder
         self._aide = Sender(folder / AIDE)
@@ -81,7 +78,7 @@ class Desk:
         signed = text.encode(errors="replace")
         if len(signed) > LONGEST:
             return {"refused": f"longer than {LONGEST} bytes"}
-        if not self._operators:
+        if not self._verifier.operators:
             return {"refused": "this server knows no operators: set keys in [server]"}
         if self.pending.is_full:
             return {"refused": "too many orders are on their way"}

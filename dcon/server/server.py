@@ -76,7 +76,7 @@ class Server:
         self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
         self._watchdog = Sender(self.folder / paths.WATCHDOG)
         self._control = Sender(self.folder / paths.CONTROL)
-        self.desk = Desk(self.folder, keys, self.status, verifier)
+        self.desk = Desk(self.folder, self.status, verifier)
         self.desk.reply_to = str(self.folder / REPLIES)
         self.operators = Operators(settings.server.listen, self.desk, self._selector)
         self._connections: list[socket.socket] = []

@@ -189,7 +189,7 @@ def test_the_server_hears_why_an_order_of_its_operator_was_refused(folder: Path)
     operators = read_keys(folder / "keys")
     with listening(folder, CONTROL, REPLIES) as (control, replies):
         aide = GuiAide(gate(folder, time.time_ns()), folder)
-        desk = Desk(folder, operators, dict, Verifier(operators))
+        desk = Desk(folder, dict, Verifier(operators))
         desk.reply_to = str(folder / REPLIES)
         with in_thread(aide.run, aide.stop):
             order = signed(folder, time_ns=time.time_ns())

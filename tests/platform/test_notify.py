@@ -23,7 +23,6 @@ def test_assignments_arrive_a_line_each(abstract: bool, tmp_path: Path) -> None:
         notifier = Notifier({"NOTIFY_SOCKET": name})
         assert notifier.tell(READY, ALIVE, status="ACTIVE\nclosed_loop")
         assert service.recv(100) == b"READY=1\nWATCHDOG=1\nSTATUS=ACTIVE closed_loop"
-        notifier.close()
 
 
 def test_nobody_there_is_no_error(tmp_path: Path) -> None:
