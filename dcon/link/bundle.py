@@ -2,11 +2,12 @@
 
 Big-endian::
 
-    4s magic "DCL1" | Q sequence | I session | q tick_ns | H entries | B kind | x
+    4s magic "DCL2" | Q sequence | I session | q tick_ns | Q tick | H entries | B kind | ? goes_on
     then each entry: B, H, I lengths of message, name, data | q log_time_ns | q publish_time_ns | the three themselves
 
 Ticks, configurations and the end are numbered from 0 without a gap, so that the server knows what it missed. What is
-repeated whenever a server connects (the head, configurations that it may not know) is not numbered.
+repeated whenever a server connects (the head, configurations that it may not know) is not numbered. Ticks are counted
+as well, so that it knows how many of them it missed.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-MAGIC = b"DCL1"
-_HEAD = struct.Struct(">4sQIqHBx")
+MAGIC = b"DCL2"
+_HEAD = struct.Struct(">4sQIqQHB?")
 _ENTRY = struct.Struct(">BHIqq")
 LARGEST = 128 << 10
 """Bytes of a bundle: what one packet of a Unix socket can surely carry. A tick that has more takes several."""
@@ -58,6 +59,10 @@ class Bundle(NamedTuple):
     """Drawn at random when the control process starts."""
     tick_ns: int
     entries: tuple[Entry, ...] = ()
+    tick: int = 0
+    """Number of its tick in the session, from 0; that of the next where it is of none."""
+    goes_on: bool = False
+    """Its tick began in the bundle before."""
 
     @property
     def is_numbered(self) -> bool:
@@ -66,8 +71,8 @@ class Bundle(NamedTuple):
 
 def encode(bundle: Bundle) -> bytes:
     """The message of a bundle."""
-    kind, sequence, session, tick_ns, entries = bundle
-    parts = [_HEAD.pack(MAGIC, sequence, session, tick_ns, len(entries), kind)]
+    kind, sequence, session, tick_ns, entries, tick, goes_on = bundle
+    parts = [_HEAD.pack(MAGIC, sequence, session, tick_ns, tick, len(entries), kind, goes_on)]
     for message, name, data, log_time_ns, publish_time_ns in entries:
         words = message.encode(), name.encode()
         parts.append(_ENTRY.pack(len(words[0]), len(words[1]), len(data), log_time_ns, publish_time_ns))
@@ -78,7 +83,7 @@ def encode(bundle: Bundle) -> bytes:
 def decode(data: bytes) -> Bundle | None:
     """The inverse; None for anything that :func:`encode` does not make."""
     try:
-        magic, sequence, session, tick_ns, count, kind = _HEAD.unpack_from(data)
+        magic, sequence, session, tick_ns, tick, count, kind, goes_on = _HEAD.unpack_from(data)
         if magic != MAGIC:
             return None
         at = _HEAD.size
@@ -90,7 +95,7 @@ def decode(data: bytes) -> Bundle | None:
             at = body + size
             words = data[texts : texts + message].decode(), data[texts + message : body].decode()
             entries.append(Entry(*words, data[body:at], log_time_ns, publish_time_ns))
-        bundle = Bundle(Kind(kind), sequence, session, tick_ns, tuple(entries))
+        bundle = Bundle(Kind(kind), sequence, session, tick_ns, tuple(entries), tick, goes_on)
     except (struct.error, ValueError):
         return None
     return bundle if at == len(data) else None

@@ -24,6 +24,8 @@ class Kept(NamedTuple):
     sequence: int
     at_ns: int
     data: bytes
+    is_tick: bool
+    """It ends a tick."""
 
 
 class Ring:
@@ -37,6 +39,8 @@ class Ring:
         """Sequence of the next."""
         self.dropped = 0
         """Bundles that fell out without having been acknowledged."""
+        self.unsafe_ticks = 0
+        """Of those bundles and of what is kept: ticks that nobody has acknowledged."""
         self._kept: deque[Kept] = deque()
 
     def __len__(self) -> int:
@@ -47,9 +51,10 @@ class Ring:
         """Sequence of the oldest; that of the next where nothing is kept."""
         return self._kept[0].sequence if self._kept else self.next
 
-    def push(self, data: bytes, now_ns: int) -> None:
+    def push(self, data: bytes, now_ns: int, *, is_tick: bool = False) -> None:
         """Keep the next; ``now_ns`` on a clock without steps."""
-        self._kept.append(Kept(self.next, now_ns, data))
+        self._kept.append(Kept(self.next, now_ns, data, is_tick))
+        self.unsafe_ticks += is_tick
         self.next += 1
         self.size += len(data)
         while self._kept and (self.size > self.most_bytes or now_ns - self._kept[0].at_ns > self.span_ns):
@@ -59,6 +64,7 @@ class Ring:
     def acknowledge(self, sequence: int) -> None:
         """All up to ``sequence`` are safe elsewhere."""
         while self._kept and self._kept[0].sequence <= sequence:
+            self.unsafe_ticks -= self._kept[0].is_tick
             self._drop()
 
     def at(self, sequence: int) -> bytes | None:
@@ -78,6 +84,7 @@ class Shipper:
         self.session = session
         self.ring = ring
         self.sent = 0
+        self._ticks = 0
         self._head = tuple(head)
         self._configs: dict[str, tuple[int, bytes]] = {}
         """By PMU, the newest and its sequence."""
@@ -93,10 +100,11 @@ class Shipper:
 
     def tick(self, tick_ns: int, entries: Iterable[Entry], now_ns: int) -> None:
         """Ship the entries of a tick: one bundle, or several where it is very large."""
-        parts = list(shares(entries))
-        for part in parts[:-1]:
-            self._push(Kind.MORE, tick_ns, part, now_ns)
-        self._push(Kind.TICK, tick_ns, parts[-1], now_ns)
+        *parts, last = shares(entries)
+        for number, part in enumerate(parts):
+            self._push(Kind.MORE, tick_ns, part, now_ns, goes_on=number > 0)
+        self._push(Kind.TICK, tick_ns, last, now_ns, goes_on=bool(parts))
+        self._ticks += 1
 
     def config(self, name: str, frame: bytes, time_ns: int, now_ns: int) -> None:
         """Ship a configuration frame of a PMU that came at ``time_ns``."""
@@ -158,7 +166,9 @@ class Shipper:
         before, self._next = self._next, max(self._next, to, self.ring.first)
         self._first += [frame for at, frame in self._configs.values() if before <= at < self._next]
 
-    def _push(self, kind: Kind, tick_ns: int, entries: tuple[Entry, ...], now_ns: int) -> bytes:
-        data = encode(Bundle(kind, self.ring.next, self.session, tick_ns, entries))
-        self.ring.push(data, now_ns)
+    def _push(
+        self, kind: Kind, tick_ns: int, entries: tuple[Entry, ...], now_ns: int, *, goes_on: bool = False
+    ) -> bytes:
+        data = encode(Bundle(kind, self.ring.next, self.session, tick_ns, entries, self._ticks, goes_on))
+        self.ring.push(data, now_ns, is_tick=kind is Kind.TICK)
         return data

@@ -158,7 +158,6 @@ class ShippedLog:
         self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
         self._news, self._clock = news, clock
         self._shown: Watchdog | None = None
-        self._ticks = 0
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
@@ -170,7 +169,6 @@ class ShippedLog:
         now_ns = self._clock.monotonic_ns()
         self._shipping.shipper.tick(tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
-        self._ticks += 1
 
     def _is_due(self, watchdog: Watchdog) -> bool:
         shown = self._shown
@@ -183,8 +181,7 @@ class ShippedLog:
     @property
     def unlogged_ticks(self) -> int:
         """Those that the server does not have, and cannot get any more."""
-        ring = self._shipping.shipper.ring
-        return min(ring.dropped + len(ring), self._ticks)
+        return self._shipping.shipper.ring.unsafe_ticks
 
     def close(self) -> None:
         shipper = self._shipping.shipper

@@ -8,21 +8,17 @@ import uuid
 from pathlib import Path
 from typing import NamedTuple
 
-from dcon.link.bundle import Bundle, Entry, Kind
+from dcon.link.assembly import Assembly, Gap, Pieces, Place
+from dcon.link.bundle import Bundle, Kind
 from dcon.server import state as states
 from dcon.server.state import State
-from dcon.session.head import head_of
+from dcon.session.head import Head, head_of
 from dcon.session.parts import free_path
 from dcon.session.rolling import RollingWriter
 from pmutools.errors import SourceError
 from pmutools.schema.log_writer import seal
-from pmutools.schema.messages import MESSAGES
 
 LOG = logging.getLogger(__name__)
-AWAY = "the server was away for longer than is kept, or they came too fast"
-UNREADABLE = "what came from the controller could not be read"
-MOST_PIECES = 512
-"""Of a head: more than any initialisation file and probing signal have."""
 
 
 class Report(NamedTuple):
@@ -56,44 +52,48 @@ class Recorder:
         self.folder = folder
         self._limits = max_mb, max_minutes
         self.gaps = 0
-        self.malformed = 0
-        """Bundles that made no sense."""
+        self._senseless = 0
+        """Heads that were whole, and said nothing."""
         self._old = states.load(folder)
-        self._session: int | None = None
+        self._assembly = Assembly()
         self._key = ""
         self._writer: RollingWriter | None = None
-        self._received = self._whole = -1
-        """Last sequence that came; last that ended what it was of."""
+        self._whole = Place()
+        """How far all that came is in the log, or counted."""
         self._tick_ns = self._safe_ns = 0
-        self._pieces: list[Bundle] = []
-        self._more: list[Entry] = []
         self._configs: dict[str, tuple[bytes, int]] = {}
         self._said = Report()
 
     @property
-    def resumes(self) -> tuple[int | None, int]:
-        """Session, and last sequence of it, that need not be sent again."""
-        if self._session is not None:
-            return self._session, self._received
-        return (None, -1) if self._old is None else (self._old.session, self._old.have)
+    def resumes(self) -> Place:
+        """What need not be sent again."""
+        return self._assembly.place if self._writer is not None or self._old is None else self._old.place
+
+    @property
+    def malformed(self) -> int:
+        """Bundles that made no sense."""
+        return self._senseless + self._assembly.malformed
 
     def take(self, bundle: Bundle) -> None:
         """Record one bundle; one that was there before, or belongs to no session that is known, is left out."""
-        if bundle.kind is Kind.HEAD:
-            self._head(bundle)
-        elif bundle.session == self._session and self._writer is not None:
-            if bundle.is_numbered:
-                self._numbered(bundle, self._writer)
-            elif bundle.kind is Kind.CONFIG:
-                self._config(bundle, self._writer, news=False)
+        assembly = self._assembly
+        if bundle.is_numbered and bundle.tick_ns > 0 and assembly.wants(bundle):
+            self._tick_ns = bundle.tick_ns
+        for item in assembly.take(bundle):
+            if isinstance(item, Pieces):
+                self._head(item)
+            elif self._writer is not None:
+                self._record(item, self._writer)
+        if not assembly.is_amid:
+            self._whole = assembly.place
 
     def flush(self) -> Report:
         """Make safe what was taken, as far as the system lets us, and say how far that is."""
         writer = self._writer
-        if writer is not None and self._session is not None:
+        if writer is not None:
             writer.flush(self._tick_ns)
             if states.save(self.folder, self._state(writer)):
-                self._said = self._said._replace(session=self._session, have=self._whole)
+                self._said = self._said._replace(session=self._whole.session, have=self._whole.have)
                 self._safe_ns = self._tick_ns
             self._said = self._said._replace(
                 file=str(writer.parts[-1]) if writer.parts else "",
@@ -113,51 +113,51 @@ class Recorder:
     def _state(self, writer: RollingWriter) -> State:
         configs = tuple((name, frame.hex(), at) for name, (frame, at) in self._configs.items())
         parts = tuple(map(str, writer.parts))
-        return State(self._session or 0, self._key, str(writer.path), self._whole, parts, writer.size, configs)
+        session, have, ticks = self._whole
+        return State(session or 0, self._key, str(writer.path), have, parts, writer.size, configs, ticks)
 
-    def _head(self, piece: Bundle) -> None:
-        if piece.session == self._session or len(piece.entries) != 1:
+    def _head(self, pieces: Pieces) -> None:
+        if self._writer is not None and pieces.session == self._assembly.place.session:
             return
-        at = piece.entries[0].log_time_ns
-        if at == 0 or (self._pieces and self._pieces[0].session != piece.session):
-            self._pieces = []
-        if at != len(self._pieces) or at >= MOST_PIECES:
-            self.malformed += 1
-            return
-        self._pieces.append(piece)
-        head = head_of(self._pieces)
+        head = head_of(pieces.bundles)
         if head is None:
+            self._senseless += 1
             return
-        self._pieces, self._more = [], []
         if self._writer is not None:
             self._writer.close()
-        self._session = piece.session
         old, self._old = self._old, None
-        parts: list[Path] = []
-        if old is not None and old.session == piece.session and self._seal(old):
+        if old is not None and old.session == pieces.session and self._seal(old):
             LOG.info("the session goes on in a new part after %s", old.parts[-1] if old.parts else self.path)
-            parts = list(map(Path, old.parts))
-            self._key, self._received = old.key, old.have
-            self._configs = {name: (bytes.fromhex(frame), at) for name, frame, at in old.configs}
-            path = Path(old.path)
+            self._open(head, old)
         else:
-            self._key, self._received, self._configs = uuid.uuid4().hex, -1, {}
-            path = self._free()
-        self._whole = self._received
+            self._open(head, self._fresh(pieces.session))
+        self.flush()
+
+    def _open(self, head: Head, state: State) -> None:
+        """Write the log of a session, from its beginning or from where ``state`` says it is."""
+        self._key = state.key
+        self._configs = {name: (bytes.fromhex(frame), at) for name, frame, at in state.configs}
+        self._whole = state.place
+        self._assembly.begin(state.place)
         max_mb, max_minutes = self._limits
+        parts = list(map(Path, state.parts))
         self._writer = RollingWriter(
-            *(path, head), max_mb=max_mb, max_minutes=max_minutes, session_id=self._key, parts=parts, patient=True
+            *(state.path, head), max_mb=max_mb, max_minutes=max_minutes, session_id=state.key, parts=parts, patient=True
         )
         for name, (frame, at) in self._configs.items():
             self._writer.config(name, frame, at)
-        self.flush()
 
-    def _free(self) -> Path:
+    def _fresh(self, session: int) -> State:
+        """A session of which nothing is there."""
+        key = uuid.uuid4().hex
+        return State(session, key, str(self._free(key)), -1)
+
+    def _free(self, key: str) -> Path:
         try:
             return free_path(self.path)
         except SourceError as error:  # it may be there later: the writer tries again and again
             LOG.error("%s", error)
-            return Path(self.path).with_stem(f"{Path(self.path).stem}-{self._key[:8]}")
+            return Path(self.path).with_stem(f"{Path(self.path).stem}-{key[:8]}")
 
     @staticmethod
     def _seal(old: State) -> bool:
@@ -171,45 +171,23 @@ class Recorder:
             return False
         return True
 
-    def _numbered(self, bundle: Bundle, writer: RollingWriter) -> None:
-        if bundle.sequence <= self._received:
-            return
-        missing = bundle.sequence - self._received - 1
-        self._received = bundle.sequence
-        self._tick_ns = bundle.tick_ns or self._tick_ns
-        if missing:
-            self._lost(writer, missing, AWAY)
-        if bundle.kind is Kind.CONFIG:
-            self._config(bundle, writer, news=True)
-        elif bundle.kind is Kind.END:
+    def _record(self, item: Bundle | Gap, writer: RollingWriter) -> None:
+        if isinstance(item, Gap):
+            self.gaps += 1
+            if item.ticks:
+                writer.lost(item.ticks, item.reason, self._tick_ns)
+        elif item.kind is Kind.CONFIG:
+            self._config(item, writer)
+        elif item.kind is Kind.END:
             writer.close()
-        elif bundle.tick_ns <= 0 or not all(map(_is_known, bundle.entries)):
-            self.malformed += 1
-            self._lost(writer, 1, UNREADABLE)
-        elif bundle.kind is Kind.MORE:
-            self._more += bundle.entries
         else:
-            writer.write([*self._more, *bundle.entries], bundle.tick_ns)
-            self._more = []
-        if not self._more:
-            self._whole = bundle.sequence
+            writer.write(item.entries, item.tick_ns)
 
-    def _config(self, bundle: Bundle, writer: RollingWriter, *, news: bool) -> None:
+    def _config(self, bundle: Bundle, writer: RollingWriter) -> None:
         for entry in bundle.entries:
-            if news or self._configs.get(entry.name, (b"",))[0] != entry.data:
+            if bundle.is_numbered or self._configs.get(entry.name, (b"",))[0] != entry.data:
                 self._configs[entry.name] = (entry.data, entry.log_time_ns)
                 writer.config(entry.name, entry.data, entry.log_time_ns)
-
-    def _lost(self, writer: RollingWriter, ticks: int, reason: str) -> None:
-        self.gaps += 1
-        self._more = []
-        writer.lost(ticks, reason, self._tick_ns)
-
-
-def _is_known(entry: Entry) -> bool:
-    if entry.message == "PmuFrame":
-        return bool(entry.name)
-    return entry.message in MESSAGES and not entry.name
 
 
 def free_percent(folder: Path) -> float | None:

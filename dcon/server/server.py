@@ -13,8 +13,9 @@ from typing import Any
 
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
+from dcon.link.assembly import Assembly, Pieces, Place
 from dcon.link.beats import LoopName, LoopState, encode_beat
-from dcon.link.bundle import LARGEST, Bundle, Entry, Kind, decode
+from dcon.link.bundle import LARGEST, Bundle, Kind, decode
 from dcon.link.keys import read_keys
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
@@ -22,7 +23,7 @@ from dcon.link.paths import Sender
 from dcon.server.desk import Desk
 from dcon.server.newest import Newest, to_json
 from dcon.server.operators import Operators
-from dcon.server.recorder import MOST_PIECES, Recorder, Report
+from dcon.server.recorder import Recorder, Report
 from dcon.server.response import LineResponse, Response
 from dcon.server.scribe import Scribe
 from dcon.session.head import Head, head_of
@@ -68,7 +69,7 @@ class Server:
         self.report = Report()
         self.failures = 0
         self.malformed = 0
-        """Messages on the controller's socket that are no bundles."""
+        """Messages on the controller's socket that are no bundles, and heads that say nothing."""
         self._selector = selectors.DefaultSelector()
         self._listener = paths.listen(self.folder, paths.SERVER)
         self._replies = paths.bind_datagram(self.folder, REPLIES)
@@ -82,8 +83,6 @@ class Server:
         self._connections: list[socket.socket] = []
         self._source: socket.socket | None = None
         """The connection whose session is being recorded."""
-        self._pieces: list[Bundle] = []
-        self._more: list[Entry] = []
         self._lag_ns: int | None = None
         self._found: Response | None = None
         self._beats = 0
@@ -91,7 +90,7 @@ class Server:
         self._acked: tuple[int | None, int] = (None, -1)
         log = settings.log
         recorder = Recorder(log.path, self.folder, max_mb=log.max_mb, max_minutes=log.max_minutes)
-        self._session, self._queued = recorder.resumes
+        self._assembly = Assembly(recorder.resumes)
         self._scribe = Scribe(recorder, self._reports.append)
 
     def run(self) -> None:
@@ -151,7 +150,7 @@ class Server:
                 "turned_away": self.operators.turned_away,
                 "orders_relayed": self.desk.relayed,
                 "orders_pending": len(self.desk.pending),
-                "malformed": self.malformed,
+                "malformed": self.malformed + self._assembly.malformed,
                 "failures": self.failures,
                 "undecodable": self.newest.undecodable,
             },
@@ -187,7 +186,8 @@ class Server:
             self._receive(sock, utc_ns)
 
         self._selector.register(sock, selectors.EVENT_READ, ready)
-        self._say(sock, {"session": self._session, "have": self._queued})
+        place = self._assembly.place
+        self._say(sock, {"session": place.session, "have": place.have})
 
     def _end(self, sock: socket.socket) -> None:
         if sock in self._connections:
@@ -226,40 +226,26 @@ class Server:
             self._take(sock, bundle, len(data), utc_ns)
 
     def _take(self, sock: socket.socket, bundle: Bundle, size: int, utc_ns: int) -> None:
-        if bundle.kind is Kind.HEAD:
-            self._head(sock, bundle)
-        elif bundle.session != self._session:
+        if not self._assembly.wants(bundle):
             return
-        elif bundle.is_numbered:
-            if bundle.sequence <= self._queued:
-                return
-            if bundle.sequence != self._queued + 1:
-                self._more = []
-            self._queued = bundle.sequence
         self._scribe.put(bundle, size)
-        if bundle.kind is Kind.MORE:
-            self._more += bundle.entries
-        elif bundle.kind is Kind.TICK:
-            whole = bundle._replace(entries=(*self._more, *bundle.entries))
-            self._more = []
-            self._look(whole, utc_ns)
+        for item in self._assembly.take(bundle):
+            if isinstance(item, Pieces):
+                self._open(sock, item)
+            elif isinstance(item, Bundle) and item.kind is Kind.TICK:
+                self._look(item, utc_ns)
 
-    def _head(self, sock: socket.socket, piece: Bundle) -> None:
+    def _open(self, sock: socket.socket, pieces: Pieces) -> None:
         """What the session is: of a session that is known too, for a server that was started again."""
-        if self._pieces and (piece.session != self._pieces[0].session or piece.entries[:1] == self._pieces[0].entries):
-            self._pieces = []
-        self._pieces.append(piece)
-        head = head_of(self._pieces)
+        head = head_of(pieces.bundles)
         if head is None:
-            del self._pieces[:-MOST_PIECES]
+            self.malformed += 1
             return
-        self._pieces = []
         self._source = sock
-        known = piece.session == self._session and head == self.newest.head
-        if piece.session != self._session:
-            self._session, self._queued = piece.session, -1
-        if not known:
-            self._more = []
+        is_new = pieces.session != self._assembly.place.session
+        if is_new:
+            self._assembly.begin(Place(pieces.session))
+        if is_new or head != self.newest.head:
             self.newest = Newest(head)
             self.response = LineResponse()
 
@@ -284,7 +270,7 @@ class Server:
             return
         self.report = report = self._reports.pop()
         safe = (report.session, report.have)
-        if safe != self._acked and report.session == self._session and self._source is not None:
+        if safe != self._acked and report.session == self._assembly.place.session and self._source is not None:
             self._acked = safe
             self._say(self._source, {"ack": report.have})
 

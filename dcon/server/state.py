@@ -11,6 +11,8 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from dcon.link.assembly import Place
+
 FILE = "server.state"
 
 
@@ -29,6 +31,13 @@ class State(NamedTuple):
     """Bytes of the last part that hold what is spoken of; None where it is ended."""
     configs: tuple[tuple[str, str, int], ...] = ()
     """PMU, configuration frame in hexadecimal, when it came."""
+    ticks: int = 0
+    """Of the session, up to ``have``."""
+
+    @property
+    def place(self) -> Place:
+        """From where the session goes on."""
+        return Place(self.session, self.have, self.ticks)
 
 
 def load(folder: Path) -> State | None:
@@ -37,7 +46,7 @@ def load(folder: Path) -> State | None:
         values = json.loads((folder / FILE).read_bytes())
         state = State(**values)
         configs = tuple((str(name), bytes.fromhex(frame).hex(), int(at)) for name, frame, at in state.configs)
-        numbers = (state.session, state.have, 0 if state.size is None else state.size)
+        numbers = (state.session, state.have, state.ticks, 0 if state.size is None else state.size)
         texts = (state.key, state.path)
         if not (all(type(number) is int for number in numbers) and all(isinstance(text, str) for text in texts)):
             return None

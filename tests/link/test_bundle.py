@@ -21,6 +21,8 @@ BUNDLE = st.builds(
     st.integers(0, 2**32 - 1),
     INT64,
     st.lists(ENTRY, max_size=5).map(tuple),
+    st.integers(0, 2**64 - 1),
+    st.booleans(),
 )
 
 
@@ -41,7 +43,7 @@ def test_what_is_cut_or_longer_is_no_bundle(bundle: Bundle, data: st.DataObject)
 
 @given(st.binary(max_size=200), st.booleans())
 def test_garbage_raises_nothing(garbage: bytes, looks_right: bool) -> None:
-    decode(b"DCL1" + garbage if looks_right else garbage)
+    decode(b"DCL2" + garbage if looks_right else garbage)
 
 
 @given(st.lists(ENTRY, max_size=30), st.integers(400, 1000))

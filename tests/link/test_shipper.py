@@ -125,6 +125,27 @@ def test_an_acknowledgement_frees_and_none_of_what_was_not_sent() -> None:
     assert len(made.ring) == 8 and made.ring.first == 2 and made.ring.size == 8 * len(made.ring.at(2) or b"")
 
 
+def test_ticks_that_nobody_has_acknowledged_are_counted_and_nothing_else() -> None:
+    made, wire = shipper(span_s=1, most_bytes=1 << 24), Wire()
+    made.config("N1", b"c", 5, 0)
+    filled(made, 3)
+    made.tick(S, [Entry("PmuFrame", "N1", bytes(50_000), 1, 1)] * 6, 0)
+    assert (made.ring.next, made.ring.unsafe_ticks) == (7, 4)
+    hello(made, None, -1)
+    made.service(wire.send)
+    made.told(b'{"ack": 1}')  # a configuration and a tick
+    assert made.ring.unsafe_ticks == 3
+    filled(made, 2, now_ns=2 * S)
+    assert (made.ring.dropped, made.ring.unsafe_ticks) == (5, 5)  # what fell out, nobody will acknowledge
+    made.end(2 * S)
+    made.service(wire.send)
+    made.told(b'{"ack": 9}')
+    assert len(made.ring) == 0 and made.ring.unsafe_ticks == 3
+    bundles = [bundle for data in wire.got[1:] if isinstance(bundle := decode(data), Bundle)]
+    assert [bundle.tick for bundle in bundles if bundle.is_numbered] == [0, 0, 1, 2, 3, 3, 3, 4, 5, 6]
+    assert [bundle.goes_on for bundle in bundles if bundle.tick == 3] == [False, True, True]
+
+
 def test_a_ring_holds_its_bounds_whatever_comes() -> None:
     rng = random.Random(3)
     ring, now_ns = Ring(5 * S, 10_000), 0

@@ -12,6 +12,7 @@ import pytest
 from support.sessions import CONFIGS, HEAD, T0
 from support.shipped import FakeControl, recorder_in, same_ticks, tick_at
 
+from dcon.link.assembly import Place
 from dcon.link.bundle import Bundle, Entry, Kind, decode
 from dcon.link.shipper import Ring, Shipper
 from dcon.server import state
@@ -37,7 +38,7 @@ class Line:
         self.connect()
 
     def connect(self) -> None:
-        session, have = self.recorder.resumes
+        session, have, _ = self.recorder.resumes
         self.control.shipper.lost()
         self.control.shipper.told(json.dumps({"session": session, "have": have}).encode())
 
@@ -183,11 +184,30 @@ def test_a_session_joined_late_begins_with_a_gap_and_all_configurations(tmp_path
     line = Line(tmp_path, ring=Ring(600 * NS, 60_000))
     for _ in range(200):
         line.control.tick()
-    missing = line.control.shipper.ring.first
+    missing = line.control.shipper.ring.first - 4  # configurations, which are told again
     reader = line.finish()
     assert reader.configs == CONFIGS
     (event,) = [event for tick in reader.ticks() for event in tick.record.events]
     assert event.detail.startswith(f"{missing} ticks were not logged")
+
+
+def test_configurations_that_were_passed_over_are_no_missing_ticks(tmp_path: Path) -> None:
+    line = Line(tmp_path)
+    for _ in range(10):
+        line.control.tick()
+        line.move()
+    line.flush()
+    line.control.shipper.config("N1", CONFIGS["N1"], T0, 0)
+    lost: list[bytes] = []
+    line.control.shipper.service(lambda data: lost.append(data) is None)
+    assert len(lost) == 1
+    for _ in range(10):
+        line.control.tick()
+    reader = line.finish()
+    same_ticks(reader, range(20))
+    report = line.recorder.flush()
+    assert (report.gaps, report.unlogged, len(reader.parts)) == (1, 0, 1)
+    assert not any(tick.after_loss for tick in reader.ticks())
 
 
 def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
@@ -196,11 +216,11 @@ def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
     line.move()
     good = tick_at(0).record.tick_ns
     nonsense = [
-        Bundle(Kind.TICK, 5, 7, good, (Entry("Nonsense", "", b"", 1, 1),)),
-        Bundle(Kind.TICK, 6, 7, good, (Entry("Tick", "N1", b"", 1, 1),)),
-        Bundle(Kind.TICK, 7, 7, -1),
-        Bundle(Kind.TICK, 3, 7, good, (Entry("Tick", "", b"\xff", 1, 1),)),
-        Bundle(Kind.TICK, 8, 99, good),
+        Bundle(Kind.TICK, 5, 7, good, (Entry("Nonsense", "", b"", 1, 1),), tick=1),
+        Bundle(Kind.TICK, 6, 7, good, (Entry("Tick", "N1", b"", 1, 1),), tick=2),
+        Bundle(Kind.TICK, 7, 7, -1, tick=3),
+        Bundle(Kind.TICK, 3, 7, good, (Entry("Tick", "", b"\xff", 1, 1),), tick=4),
+        Bundle(Kind.TICK, 8, 99, good, tick=4),
         Bundle(Kind.HEAD, 0, 8, 0, (Entry("head", "values", b"{", 0, 1),)),
         Bundle(Kind.HEAD, 0, 8, 0, (Entry("head", "values", b"{", 7, 9),)),
         Bundle(Kind.HEAD, 0, 8, 0, ()),
@@ -208,7 +228,7 @@ def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
     for bundle in nonsense:
         line.recorder.take(bundle)
     line.recorder.close()
-    assert line.recorder.malformed == 4 and line.recorder.gaps == 3
+    assert line.recorder.malformed == 6 and line.recorder.gaps == 3 == line.recorder.flush().unlogged
     same_ticks(SessionReader(tmp_path / "session.mcap"), range(1))
 
 
@@ -216,7 +236,7 @@ def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
 def test_a_damaged_state_begins_a_new_log(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / state.FILE).write_bytes(content)
-    assert recorder_in(tmp_path).resumes == (None, -1)
+    assert recorder_in(tmp_path).resumes == Place()
 
 
 def test_a_log_that_is_gone_is_begun_anew(tmp_path: Path) -> None:
@@ -279,7 +299,7 @@ def test_a_session_of_several_lives_replays_bit_for_bit(tmp_path: Path) -> None:
     for number, tick in enumerate(source.ticks()):
         if number % 100 == 0:
             recorder = recorder_in(tmp_path)
-            session, have = recorder.resumes
+            session, have, _ = recorder.resumes
             shipper.told(json.dumps({"session": session, "have": have}).encode())
         entries = tick_entries(source.instances, tick.record, tick.frames, tick.orders, pdci=tick.pdci)
         shipper.tick(tick.record.tick_ns, entries, 0)
