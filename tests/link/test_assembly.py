@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.link.assembly import AWAY, MOST_PARTS, TOO_LARGE, Assembly, Gap, Item, Pieces, Place
+from dcon.link.assembly import AWAY, MOST_PARTS, TOO_LARGE, UNREADABLE, Assembly, Gap, Item, Pieces, Place
 from dcon.link.bundle import UNNUMBERED, Bundle, Entry, Kind, decode, pieces, shares
 
 SESSION = 7
@@ -173,6 +173,32 @@ def test_a_head_is_whole_or_not_told(order: list[int]) -> None:
             assert item == Pieces(3, tuple(cut))
     (whole,) = [item for bundle in cut for item in assembly.take(bundle)]
     assert whole == Pieces(3, tuple(cut)) and assembly.take(cut[-1]) == [] and assembly.place == Place()
+
+
+def test_a_head_of_another_session_or_content_begins_anew() -> None:
+    first, other = (
+        [bundle for data in pieces(session, {}, {"a": bytes([session]) * 700}, 500) if (bundle := decode(data))]
+        for session in (3, 4)
+    )
+    assembly = Assembly()
+    found = [item for piece in (*first[:2], *other) for item in assembly.take(piece)]
+    assert found == [Pieces(4, tuple(other))] and not assembly.malformed
+    again = [bundle._replace(session=3) for bundle in other]
+    found = [item for piece in (*first[:2], *again) for item in assembly.take(piece)]
+    assert found == [Pieces(3, tuple(again))]
+
+
+def test_parts_that_do_not_fit_are_a_gap_of_their_tick() -> None:
+    more = Bundle(Kind.MORE, 0, SESSION, 1, (entry(b"a"),), 0)
+    tick = Bundle(Kind.TICK, 1, SESSION, 1, (entry(b"b"),), 0)
+    assembly = Assembly(Place(SESSION))
+    assert assembly.take(more) == [] and assembly.take(tick) == [Gap(0, 1, UNREADABLE)]  # it goes on with nothing
+    assert not assembly.is_amid and assembly.malformed == 1
+    assembly = Assembly(Place(SESSION))
+    rest = tick._replace(sequence=0, goes_on=True)
+    assert assembly.take(rest) == [Gap(0, 1, UNREADABLE)] and assembly.malformed == 1
+    after = tick._replace(tick=1)
+    assert assembly.take(after) == [after] and assembly.place == Place(SESSION, 1, 2)
 
 
 def test_what_is_repeated_is_passed_on_without_a_number() -> None:
