@@ -37,10 +37,8 @@ class Ring:
         self.size = 0
         self.next = 0
         """Sequence of the next."""
-        self.dropped = 0
-        """Bundles that fell out without having been acknowledged."""
         self.unsafe_ticks = 0
-        """Of those bundles and of what is kept: ticks that nobody has acknowledged."""
+        """That nobody has acknowledged: kept still, or fallen out."""
         self._kept: deque[Kept] = deque()
 
     def __len__(self) -> int:
@@ -59,7 +57,6 @@ class Ring:
         self.size += len(data)
         while self._kept and (self.size > self.most_bytes or now_ns - self._kept[0].at_ns > self.span_ns):
             self._drop()
-            self.dropped += 1
 
     def acknowledge(self, sequence: int) -> None:
         """All up to ``sequence`` are safe elsewhere."""

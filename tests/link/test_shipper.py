@@ -95,7 +95,7 @@ def test_what_fell_out_of_the_ring_leaves_a_gap_and_its_configuration_is_told() 
     made.config("N1", b"c", 5, 0)
     filled(made, 3)
     filled(made, 2, now_ns=2 * S)
-    assert made.ring.dropped == 4 and made.ring.first == 4
+    assert made.ring.unsafe_ticks == 5 and made.ring.first == 4
     hello(made, None, -1)
     made.service(wire.send)
     assert wire.numbers() == ["head", "config", 4, 5]
@@ -136,7 +136,7 @@ def test_ticks_that_nobody_has_acknowledged_are_counted_and_nothing_else() -> No
     made.told(b'{"ack": 1}')  # a configuration and a tick
     assert made.ring.unsafe_ticks == 3
     filled(made, 2, now_ns=2 * S)
-    assert (made.ring.dropped, made.ring.unsafe_ticks) == (5, 5)  # what fell out, nobody will acknowledge
+    assert (made.ring.first, made.ring.unsafe_ticks) == (7, 5)  # what fell out, nobody will acknowledge
     made.end(2 * S)
     made.service(wire.send)
     made.told(b'{"ack": 9}')
