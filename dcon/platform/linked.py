@@ -163,10 +163,11 @@ class ShippedLog:
         self._shipping.shipper.config(name, frame, time_ns, self._clock.monotonic_ns())
 
     def write(self, entries: Sequence[Entry], tick_ns: int) -> None:
-        if (watchdog := watchdog_of(self._news.heard, tick_ns)) is not None and self._is_due(watchdog):
+        now_ns = self._clock.monotonic_ns()
+        watchdog = watchdog_of(self._news.heard, tick_ns, now_ns)
+        if watchdog is not None and self._is_due(watchdog):
             entries = (*entries, watchdog_entry(watchdog))
             self._shown = watchdog
-        now_ns = self._clock.monotonic_ns()
         self._shipping.shipper.tick(tick_ns, entries, now_ns)
         self._shipping.service(now_ns)
 

@@ -253,4 +253,5 @@ _FRAME_FIELDS = frozenset(
 
 def _watchdog(message: Any) -> Watchdog:
     heartbeats = tuple(zip(message.heartbeat, message.heartbeat_age_ms, strict=False))
-    return Watchdog(message.time_ns, message.relays_closed, message.estop, message.latched, message.reason, heartbeats)
+    said = (message.relays_closed, message.estop, message.latched, message.reason)
+    return Watchdog(message.time_ns, *said, heartbeats, message.silent)

@@ -29,7 +29,6 @@ from support.swing import Streams
 from dcon.sections import Platform
 from dcon.session.codec import Timing
 from dcon.session.reader import SessionReader
-from dcon.settings import Platform
 from pmutools.grid.pmu_model import fleet
 from pmutools.timebase import NS
 

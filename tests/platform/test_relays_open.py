@@ -15,7 +15,7 @@ from support.running import Running
 
 from dcon.cli import dcon
 from dcon.link import paths
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.watchdog.codec import encode_status
 from dcon.watchdog.latch import NAME
 from pmutools.cli.shell import run

@@ -23,6 +23,7 @@ from dcon.link.orders import SignedOrder, sign
 from dcon.link.paths import bind_datagram, prepare
 from dcon.server import operators
 from dcon.server.client import Client
+from dcon.session.codec import Watchdog
 from dcon.session.reader import SessionReader
 from pmutools.cli.shell import run
 from pmutools.net.endpoint import Endpoint, Scheme

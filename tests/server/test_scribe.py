@@ -25,7 +25,7 @@ from dcon.server.recorder import Recorder, Report
 from dcon.server.scribe import Scribe
 from dcon.server.server import Server
 from dcon.session.reader import SessionReader
-from dcon.settings import Log, parse
+from dcon.settings import parse
 
 BUNDLE = Bundle(Kind.TICK, 0, 7, tick_at(0).record.tick_ns)
 

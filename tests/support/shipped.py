@@ -16,7 +16,8 @@ from dcon.link.paths import SERVER
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
 from dcon.server.recorder import Recorder
-from dcon.session.encode import tick_entries
+from dcon.session.codec import Watchdog
+from dcon.session.encode import tick_entries, watchdog_entry
 from dcon.session.reader import SessionReader
 from pmutools.timebase import NS
 
