@@ -49,7 +49,7 @@ class Counts:
     foreign: int = 0
     """Frames that no PMU of the settings sends: another IDCODE, or another source."""
     undecodable: int = 0
-    """Runs of bytes in no frame."""
+    """Runs of bytes in no frame, and frames of a configuration that is too long to be handed on."""
     own_drops: int = 0
     """Datagrams that a full receive buffer of this machine has lost."""
     crowded: int = 0

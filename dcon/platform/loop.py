@@ -79,7 +79,7 @@ class Summary:
     foreign: int = 0
     """Frames that no PMU of the settings sends: another IDCODE, or another source."""
     undecodable: int = 0
-    """Runs of bytes that were no frame."""
+    """Runs of bytes that were no frame, and frames of a configuration that is too long to be handed on."""
     own_drops: int = 0
     """Datagrams that this machine's full receive buffers have lost."""
     crowded: int = 0

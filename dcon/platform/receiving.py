@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from dcon.link.crossing import Counts, Item, PmuFrameIn
 from pmutools.c37118 import FrameType, Loss, Message, StreamConfig, decode_config
 from pmutools.c37118.config import encode_config
-from pmutools.errors import WireError
+from pmutools.errors import EncodeError, WireError
 from pmutools.flow import Chunk
-from pmutools.net.dialogue import LinkEvent
+from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.receiver import Receivers
 
 
@@ -25,6 +25,8 @@ class Reception:
         self.receivers = receivers
         self.counts = Counts() if counts is None else counts
         self._configs: dict[int, StreamConfig] = {}
+        self._refused: set[int] = set()
+        """Whose newest configuration cannot be handed on: their data would be read by an older one."""
 
     def receive(self, timeout_ns: int) -> list[Chunk | LinkEvent]:
         """What has come; waits for it at most ``timeout_ns``."""
@@ -48,17 +50,36 @@ class Reception:
         frame, flow, config = message
         for owner in self.receivers.owners(flow, frame.idcode):
             if frame.type is FrameType.DATA:
-                take(PmuFrameIn(owner, frame))
+                if owner in self._refused:
+                    self.counts.undecodable += 1
+                else:
+                    take(PmuFrameIn(owner, frame))
             elif config is not None and frame.type.rules_data and self._configs.get(owner) != config:
                 self._configs[owner] = config
-                take(PmuFrameIn(owner, frame._replace(data=_whole(frame.data, config)), is_config=True))
+                take(self._handed_on(owner, message, config))
+
+    def _handed_on(self, owner: int, message: Message, config: StreamConfig) -> Item:
+        """The configuration in one frame; where none has room for it, that it is refused."""
+        frame, flow, _ = message
+        try:
+            whole = _whole(frame.data, config)
+        except EncodeError as error:
+            self._refused.add(owner)
+            self.counts.undecodable += 1
+            where = f"{flow.transport}://{flow.source}"
+            return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), f"{error}; it is refused", frame.idcode, flow)
+        self._refused.discard(owner)
+        return PmuFrameIn(owner, frame._replace(data=whole), is_config=True)
 
     def close(self) -> None:
         self.receivers.close()
 
 
 def _whole(data: bytes, config: StreamConfig) -> bytes:
-    """A frame that says ``config`` by itself: that which came, unless it was the last of several."""
+    """A frame that says ``config`` by itself: that which came, unless it was the last of several.
+
+    Raises EncodeError where those were more than fits into one.
+    """
     try:
         if decode_config(data)[1] == config:
             return data
