@@ -45,7 +45,7 @@ CLOCK_CHECK_TICKS = 60
 CATCH_UP_S = 1
 """Ticks missed for longer are left out: whatever they would have held up has gone wrong by then."""
 TOLD = 10
-"""Warnings of one kind about streams; more of it go to the verbose log."""
+"""Warnings of one kind about streams, or of configurations of one PMU; more of it go to the verbose log."""
 TROUBLE = frozenset(
     (
         LinkKind.FOREIGN,
@@ -83,7 +83,10 @@ class Summary:
     own_drops: int = 0
     """Datagrams that this machine's full receive buffers have lost."""
     crowded: int = 0
-    """Frames that came in a flood, or while the loop stood still, and found no room to wait."""
+    """Frames that came in a flood, or while the loop stood still, and found no room to wait; those of a PMU whose
+    configuration had to."""
+    overtaken_configs: int = 0
+    """Configurations that a newer one of their PMU replaced before they were taken."""
     unsent: int = 0
     """Commands that the system refused to send, or that nobody listened to."""
     unlogged_ticks: int = 0
@@ -115,6 +118,7 @@ class Platform:
         self.stopping = False
         self._ticked = ticked
         self._told = Counter[LinkKind]()
+        self._unusable = Counter[str]()
         self._waiting = Waiting()
         self._configs: list[tuple[str, bytes, int]] = []
 
@@ -176,6 +180,8 @@ class Platform:
             frames.wait(deadline_ns)
             started_ns = clock.monotonic_ns()
             self._take(frames.take())
+            for name, frame in self._waiting.configs(started_ns):
+                self._configure(name, frame)
             told = news.told(started_ns)
             summary.trouble = summary.trouble or told.trouble
             orders = self._orders(book.due(tick_ns), told, ending)
@@ -237,7 +243,7 @@ class Platform:
                 case PmuFrameIn(pmu, frame, False):
                     self._waiting.add(sites[pmu].name, frame)
                 case PmuFrameIn(pmu, frame, True):
-                    self._configure(sites[pmu].name, frame)
+                    self._waiting.add_config(sites[pmu].name, frame)
                 case LinkEvent():
                     self._tell(item)
                 case Failure(reason):
@@ -261,7 +267,8 @@ class Platform:
         if (problem := engine.reconfigure(name, config)) is not None:
             if known is None and engine.state.system is SystemState.INIT:
                 raise SettingsError(problem)
-            LOG.warning("%s", problem)
+            self._unusable[name] += 1
+            LOG.log(logging.WARNING if self._unusable[name] <= TOLD else logging.INFO, "%s", problem)
         self._configs.append((name, frame.data, frame.arrival_ns or 0))
 
     def _sum_up(self, log: Log) -> None:
@@ -270,6 +277,7 @@ class Platform:
         summary.final_state = str(self.engine.state.system)
         summary.foreign, summary.undecodable, summary.own_drops = counts.foreign, counts.undecodable, counts.own_drops
         summary.crowded = counts.crowded + self._waiting.crowded
+        summary.overtaken_configs = self._waiting.overtaken
         summary.unsent = self.ends.command.failed
         summary.unlogged_ticks = log.unlogged_ticks
         summary.log_parts = list(map(str, log.parts))

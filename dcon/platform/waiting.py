@@ -1,4 +1,4 @@
-"""Frames between their arrival and the tick that takes them."""
+"""Frames and configurations between their arrival and the tick that takes them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,37 @@ FRAMES_A_TICK = 16
 WAITING = 512
 """Frames of one PMU that may wait; more are counted and gone. A second of 60 frames/s is made up for."""
 
+CONFIGS = 4
+CONFIGS_NS = 10 * NS
+"""So many configurations of one PMU are taken in so long; the newest of those beyond waits, however it may flood."""
+
 
 class Waiting:
-    """The queues of all PMUs."""
+    """The queues of all PMUs, and the newest configuration of each that is not in force yet."""
 
     def __init__(self) -> None:
         self._queues: dict[str, deque[Frame]] = {}
+        self._configs: dict[str, Frame] = {}
+        self._taken: dict[str, deque[int]] = {}
+        """When the last configurations were."""
         self.crowded = 0
-        """Frames for which there was no room."""
+        """Frames for which there was no room, and those of a PMU whose configuration had to wait."""
+        self.overtaken = 0
+        """Configurations that a newer one replaced before they were taken."""
+
+    def add_config(self, name: str, frame: Frame) -> None:
+        self.overtaken += name in self._configs
+        self._configs[name] = frame
+
+    def configs(self, now_ns: int) -> list[tuple[str, Frame]]:
+        """Those to be put in force now, by PMU; ``now_ns`` is of a clock without steps."""
+        ready: list[tuple[str, Frame]] = []
+        for name in list(self._configs):
+            taken = self._taken.setdefault(name, deque(maxlen=CONFIGS))
+            if len(taken) < CONFIGS or now_ns - taken[0] >= CONFIGS_NS:
+                taken.append(now_ns)
+                ready.append((name, self._configs.pop(name)))
+        return ready
 
     def add(self, name: str, frame: Frame) -> None:
         queue = self._queues.setdefault(name, deque())
@@ -40,7 +63,9 @@ class Waiting:
                 frame = queue.popleft()
                 (later if tick_ns < (frame.arrival_ns or 0) <= tick_ns + LATEST_NS else now).append(frame)
             queue.extendleft(reversed(later))
-            if now:
+            if name in self._configs:  # not in force yet: by another they would be misread
+                self.crowded += len(now)
+            elif now:
                 taken[name] = now
         return taken
 

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 from support.swing import MS, START_NS, Streams
-from support.virtual_platform import FLOWS, ORDERS, Bench, Item, config_chunk, stream, virtual_platform
+from support.virtual_platform import FLOWS, ORDERS, STREAMS, Bench, Item, config_chunk, stream, virtual_platform
 
 from dcon.core.values import SystemState
 from dcon.limiter import SLEW_MW_PER_S
 from dcon.platform.loop import EARLY_NS, TOLD
 from dcon.platform.orders import parse_order
-from dcon.session.reader import SessionReader
+from dcon.platform.waiting import CONFIGS
+from dcon.session.log import SessionReader
 from dcon.session.replay import identical
 from pmutools.c37118 import StreamConfig
 from pmutools.errors import SettingsError
@@ -158,6 +159,23 @@ def test_a_configuration_that_changes_is_an_event_and_switches_bumplessly(bench:
     assert switched[0].state is SystemState.ACTIVE
     assert made.platform.engine.unread == {}
     assert max(made.steps_mw()) <= SLEW_MW_PER_S / 60 + 1e-9
+    made.ended_well()
+
+
+def test_a_source_that_changes_its_configuration_without_end_costs_little_and_replays(
+    bench: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two in turn, eleven of them a tick; one is unusable."""
+    caplog.set_level(logging.WARNING)
+    both = [STREAMS.configs["N2"], at_50("N2")]
+    times = range(START_NS + 3 * NS // 2, START_NS + 3 * NS, NS // 660)
+    made = bench([*stream(3), *(config_chunk("N2", at, both[k % 2]) for k, at in enumerate(times))])
+    summary = made.run(3)
+    told = [event for record in made.records for event in record.events if event.name.startswith("config_")]
+    assert 0 < len(told) <= 2 * CONFIGS and len(caplog.records) <= CONFIGS
+    assert summary.overtaken_configs > 900 and summary.crowded > 50
+    last = next(record for record in made.records if record.tick_ns >= START_NS + round(2.9 * NS))
+    assert last.active == 0 and last.state is SystemState.ACTIVE
     made.ended_well()
 
 

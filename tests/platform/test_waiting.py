@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.platform.waiting import FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
+from dcon.platform.waiting import CONFIGS, CONFIGS_NS, FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
 from pmutools.c37118 import Frame
 from pmutools.flow import StampSource
 
@@ -54,3 +54,30 @@ def test_each_frame_is_taken_once_in_its_turn(arrivals: list[tuple[str, int]]) -
             assert all((f.arrival_ns or 0) <= TICK_NS + k for f in frames)
             taken += [(name, (f.arrival_ns or 0) - TICK_NS) for f in frames]
     assert sorted(taken) == sorted(arrivals) and len(waiting) == 0 and waiting.crowded == 0
+
+
+def test_of_the_configurations_of_a_tick_the_newest_of_each_pmu_counts_and_the_rest_is_counted() -> None:
+    waiting = Waiting()
+    given = [Frame(bytes([number]), 1, StampSource.KERNEL, 0) for number in range(6)]
+    for name, one in zip(("N1", "S1", "N1", "N1", "S1"), given, strict=False):
+        waiting.add_config(name, one)
+    assert waiting.configs(0) == [("N1", given[3]), ("S1", given[4])] and waiting.overtaken == 3
+    assert waiting.configs(0) == []
+
+
+def test_more_configurations_of_a_pmu_than_it_may_have_wait_and_its_frames_are_not_read_meanwhile() -> None:
+    waiting = Waiting()
+    for now_ns in range(CONFIGS):
+        waiting.add_config("N1", frame(now_ns))
+        assert len(waiting.configs(now_ns)) == 1
+    waiting.add_config("N1", frame(100))
+    waiting.add_config("S1", frame(101))
+    assert [name for name, _ in waiting.configs(100)] == ["S1"]
+    for name in ("N1", "S1"):
+        waiting.add(name, frame(TICK_NS))
+    assert list(waiting.take(TICK_NS)) == ["S1"] and waiting.crowded == 1
+    waiting.add_config("N1", frame(102))
+    assert waiting.configs(CONFIGS_NS - 1) == []
+    assert waiting.configs(CONFIGS_NS) == [("N1", frame(102))] and waiting.overtaken == 1
+    waiting.add("N1", frame(TICK_NS))
+    assert list(waiting.take(TICK_NS)) == ["N1"]
