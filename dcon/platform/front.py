@@ -2,8 +2,8 @@
 
 ``python -m dcon.platform.front --ini FILE --fd N --run-dir DIR``, with one end of a SEQPACKET socket pair inherited as
 descriptor N. Its loops ``udp`` and ``parse`` take turns in one thread, and each beats to the watchdog. It never waits
-for the control process: data frames that the pair has no room for are counted, configurations and news are kept. It
-ends when the pair does.
+for the control process: data frames that the pair has no room for are counted; the newest configurations, and news, are
+kept. It ends when the pair does.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
 BEAT_NS = 10_000_000
 KEPT = 1000
-"""Configurations and news that may wait for room in the pair; the oldest go first."""
+"""News that may wait for room in the pair; the oldest go first. Of configurations the newest of each PMU waits too."""
 COUNTS_NS = 500_000_000
 PRIORITY = 9
 """One below the control process."""
@@ -41,6 +41,10 @@ class Outlet:
         sock.setblocking(False)
         self._sock = sock
         self._counts = counts
+        self._configs: dict[int, PmuFrameIn] = {}
+        """By PMU, the newest that waits for room."""
+        self._news: list[Item] = []
+        """What else does."""
         self._items: list[Item] = []
         self.is_open = True
         """Somebody is there to take what comes."""
@@ -50,22 +54,34 @@ class Outlet:
         self._items.append(item)
 
     def flush(self) -> None:
-        items, self._items = self._items, []
+        """Send what waits, then what is new, in order, up to the first message that finds no room: a smaller one after
+        it may find some, and must not overtake a configuration."""
+        items = [*self._configs.values(), *self._news, *self._items]
+        self._configs, self._news, self._items = {}, [], []
+        sent = 0
         for message, inside in encode(items):
             try:
                 self._sock.send(message)
             except BlockingIOError:
-                self._keep(inside)
+                self._keep(items[sent:])
+                return
             except OSError:
                 self.is_open = False
+                return
+            sent += len(inside)
 
     def _keep(self, items: list[Item]) -> None:
         for item in items:
-            if isinstance(item, PmuFrameIn) and not item.is_config:
-                self._counts.crowded += 1
-            elif not isinstance(item, Counts):
-                self._items.append(item)
-        del self._items[:-KEPT]
+            match item:
+                case PmuFrameIn(pmu, _, True):
+                    self._configs[pmu] = item
+                case PmuFrameIn():
+                    self._counts.crowded += 1
+                case Counts():  # newer ones follow
+                    pass
+                case _:
+                    self._news.append(item)
+        del self._news[:-KEPT]
 
 
 class Front:

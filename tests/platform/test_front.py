@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -171,6 +172,63 @@ def test_a_control_process_that_stands_still_is_not_waited_for_and_loses_no_conf
     assert taken + rig.counts.crowded == sent
 
 
+def config(pmu: int, mark: int, nbytes: int = 60_000) -> PmuFrameIn:
+    return PmuFrameIn(pmu, Frame(bytes([mark]) * nbytes, 1, StampSource.KERNEL, 0), is_config=True)
+
+
+def test_data_never_overtake_a_configuration_that_found_no_room() -> None:
+    """There is room for small messages, and for no large one."""
+    ours, theirs = pair(SMALL_BYTES)
+    with ours, theirs:
+        ours.setblocking(False)
+        outlet = Outlet(theirs, Counts())
+        big, data = Frame(bytes(60_000), 1, StampSource.KERNEL, 0), Frame(b"d", 1, StampSource.KERNEL, 0)
+        sent = 0
+        while outlet._counts.crowded == 0:
+            outlet.add(PmuFrameIn(0, big))
+            outlet.flush()
+            sent += 1
+            assert sent < 1000
+        for item in (config(1, 7), PmuFrameIn(1, data), config(1, 8), PmuFrameIn(1, data), PmuFrameIn(0, big)):
+            outlet.add(item)
+        outlet.flush()
+        outlet.add(PmuFrameIn(1, data))
+        outlet.flush()
+        found: list[Item] = []
+        for _ in range(sent + 5):
+            try:
+                found += decode(ours.recv(1 << 18))
+            except BlockingIOError:
+                outlet.flush()
+        frames = [item for item in found if isinstance(item, PmuFrameIn) and item.pmu == 1]
+        assert frames == [config(1, 8)], "the newest, and none of the data before it"
+        assert outlet._counts.crowded == 1 + 4
+
+
+def test_news_without_end_push_no_configuration_out() -> None:
+    ours, theirs = pair(SMALL_BYTES)
+    with ours, theirs:
+        ours.setblocking(False)
+        outlet = Outlet(theirs, Counts())
+        while not outlet._counts.crowded:
+            outlet.add(PmuFrameIn(0, Frame(bytes(60_000), 1, StampSource.KERNEL, 0)))
+            outlet.flush()
+        for pmu in range(3):
+            outlet.add(config(pmu, pmu))
+        for number in range(3 * KEPT):
+            outlet.add(LinkEvent(LinkKind.FOREIGN, f"{number}" + 1000 * "x", ()))
+            outlet.flush()
+        found: list[Item] = []
+        for _ in range(100):
+            with suppress(BlockingIOError):
+                found += decode(ours.recv(1 << 18))
+            outlet.flush()
+        assert [item for item in found if isinstance(item, PmuFrameIn) and item.is_config] == [
+            config(pmu, pmu) for pmu in range(3)
+        ]
+        assert sum(isinstance(item, LinkEvent) for item in found) <= KEPT + 200
+
+
 def test_news_that_wait_are_bounded() -> None:
     ours, theirs = pair(SMALL_BYTES)
     with ours, theirs:
@@ -180,7 +238,7 @@ def test_news_that_wait_are_bounded() -> None:
             if number % 100 == 0 or number < KEPT:
                 outlet.flush()
         outlet.flush()
-        assert len(outlet._items) == KEPT
+        assert len(outlet._news) == KEPT
         assert outlet.is_open
 
 
