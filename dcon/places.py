@@ -186,6 +186,10 @@ def _modbus(text: str, keys: type[Keys]) -> tuple[str, int, Keys]:
         raise ValueError(f"{text}: {str(error).lower()}") from None
     if not parts.hostname or parts.username is not None or parts.path not in ("", "/") or parts.fragment:
         raise ValueError(f"{text}: only modbus://HOST:PORT?key=value is understood")
+    try:
+        parts.hostname.encode("idna")
+    except UnicodeError:
+        raise ValueError(f"{text}: {parts.hostname!r} can be no host's name; write one, or an address") from None
     return parts.hostname, port, _keys(keys, text, parts.query)
 
 

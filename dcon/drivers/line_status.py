@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from dcon.core.values import Pdci
-from dcon.drivers.modbus import Bus, BusError
+from dcon.drivers.modbus import Bus, BusError, told
 from dcon.drivers.udp_command import follows
 from dcon.places import ModbusLine
 from pmutools.timebase import NS
@@ -126,9 +126,9 @@ class LineOnModbus:
             try:
                 line = self.ask(time.time_ns())
                 self.newest, self.trouble = line or self.newest, "" if line else "the device's counter stands still"
-            except BusError as error:
+            except Exception as error:  # the edge of the thread, which must not end unseen
                 self.failed += 1
-                self.trouble = str(error)
+                self.trouble = told(error)
             self._stopped.wait(self._keys.period_ms / 1e3)
 
     def ask(self, utc_ns: int) -> Pdci | None:

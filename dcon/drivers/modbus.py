@@ -88,10 +88,12 @@ class Bus:
         self._client.close()
 
     def _ask(self, method: str, address: int, **what: Any) -> Any:
-        if not self._client.connect():
-            raise self._failure("no connection; is the device on, and address and port right?")
         try:
+            if not self._client.connect():
+                raise self._failure("no connection; is the device on, and address and port right?")
             answer = getattr(self._client, method)(address, device_id=self._unit, **what)
+        except BusError:
+            raise
         except Exception as error:  # pymodbus decodes what anybody may have sent: no list of its errors is complete
             raise self._failure(_reason(error)) from None
         if answer.isError():
@@ -103,6 +105,11 @@ class Bus:
         """A late answer must not be taken for one to the next question: the connection goes."""
         self._client.close()
         return BusError(f"{self._where}: {reason}")
+
+
+def told(error: Exception) -> str:
+    """An error for people; one that nobody expected has its name."""
+    return str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
 
 
 def _reason(error: Exception) -> str:

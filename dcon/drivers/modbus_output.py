@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 
 from dcon.drivers.driver import Readback, bounded_v
-from dcon.drivers.modbus import Bus, BusError, to_registers
+from dcon.drivers.modbus import Bus, to_registers, told
 from dcon.places import ModbusPlace
 
 RETRY_S = 0.1
@@ -69,9 +69,9 @@ class ModbusDriver:
             try:
                 self._readback = Readback(number, self._carry_out(output_v))
                 self.trouble = ""
-            except BusError as error:
+            except Exception as error:  # the edge of the thread, which must not end unseen
                 self.failed += 1
-                self.trouble, self._readback = str(error), None
+                self.trouble, self._readback = told(error), None
                 with self._news:
                     if self._wanted is None:
                         self._wanted = number, output_v

@@ -18,9 +18,10 @@ from support.live import free_ports
 from support.modbus_device import Device, modbus_device, wait_for
 from support.requires import requires_module
 
+from dcon.drivers.line_status import LineOnModbus
 from dcon.drivers.modbus import Bus, BusError, from_registers, to_registers
 from dcon.drivers.modbus_output import ModbusDriver
-from dcon.places import ModbusPlace, OutputRegisters
+from dcon.places import ModbusLine, ModbusPlace, OutputRegisters, StatusRegisters
 from pmutools.errors import SettingsError
 
 pytestmark = pytest.mark.realtime
@@ -282,6 +283,30 @@ def test_a_readback_register_that_there_is_not() -> None:
         assert "register 200: exception 2" in driver.trouble
         assert device.registers[0] == 1000, "it was written all the same"
         assert driver.readback() is None
+
+
+def test_whatever_the_library_raises_is_trouble_and_the_threads_go_on() -> None:
+    """A host whose name cannot be one: pymodbus lets the error of its connecting through."""
+    with pytest.raises(BusError, match=r"^plc\.\.local:1: "):
+        Bus("plc..local", 1, 1, 0.1).words(0, 1)
+    driver = ModbusDriver(ModbusPlace("plc..local", 1, OutputRegisters(timeout_ms=50.0)))
+    line = LineOnModbus(ModbusLine("plc..local", 1, StatusRegisters(timeout_ms=50.0, period_ms=20.0)))
+    driver.drive(1, 1.0)
+    wait_for(lambda: driver.failed > 1 and line.failed > 1)
+    assert "plc..local:1: " in driver.trouble and "plc..local:1: " in line.trouble
+    driver.close()
+    line.close()
+
+
+def test_an_error_in_a_thread_itself_is_trouble_until_it_has_passed() -> None:
+    with modbus_device() as device, driving(device.port) as driver:
+        right, driver._bus = driver._bus, None  # type: ignore[assignment]
+        driver.drive(1, 1.0)
+        wait_for(lambda: driver.failed > 1)
+        assert "AttributeError" in driver.trouble
+        driver._bus = right
+        wait_for(answered(driver))
+        assert driver.trouble == "" and device.registers[0] == 1000
 
 
 def test_closing_on_a_dead_bus_ends_soon() -> None:

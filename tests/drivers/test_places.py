@@ -37,6 +37,8 @@ def test_what_urls_mean() -> None:
         ("iio:///x?bits=", "'' is not a whole number"),
         ("modbus://", "only modbus://HOST:PORT?key=value is understood"),
         ("modbus://user@h", "only modbus://HOST:PORT?key=value is understood"),
+        ("modbus://plc..local", "'plc..local' can be no host's name"),
+        (f"modbus://{64 * 'x'}.local", "can be no host's name"),
         ("modbus://h/1", "only modbus://HOST:PORT?key=value is understood"),
         ("modbus://h:99999", "port out of range"),
         ("modbus://h?type=int32", "'int32' is not one of int16, float32"),
