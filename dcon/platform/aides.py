@@ -35,7 +35,8 @@ from dcon.link.keys import read_keys
 from dcon.link.paths import Sender
 from dcon.places import LineSource, ModbusLine
 from dcon.platform.gps_lock import Lock, Verdict, judge
-from dcon.platform.order_gate import OrderGate
+from dcon.platform.handing import Handing, Reply
+from dcon.platform.order_gate import OrderGate, Passed
 from dcon.platform.pulse import Pulse
 from dcon.sections import Platform
 from dcon.settings import Settings, load
@@ -52,6 +53,8 @@ from pmutools.timebase import NS
 LOG = logging.getLogger("dcon.platform.aides")  # also as __main__
 ROUND_S = 0.1
 """Longest wait of a loop."""
+AGAIN_S = 0.005
+"""From one try to hand on an order to the next."""
 TELL_NS = NS
 """The lock is told so often, and when it changes."""
 ASK_S = 1.0
@@ -228,21 +231,25 @@ class GuiAide(Aide):
         super().__init__(LoopName.GUI, run_dir)
         self._inbox = paths.bind_datagram(run_dir, paths.AIDE)
         self.gate = gate
+        self.handing = Handing()
         self._run_dir = run_dir.resolve()
 
     def round(self) -> None:
-        if not select.select([self._inbox], [], [], ROUND_S)[0]:
-            return
-        with suppress(BlockingIOError):
-            passed = self.gate.take(self._inbox.recv(1 << 16), time.monotonic_ns(), time.time_ns())
-            if passed.news is not None:
-                self.tell(passed.news)
-            if passed.reply is not None and passed.reply_to:
-                self._reply(Path(passed.reply_to), passed.reply)
+        passed = Passed()
+        if select.select([self._inbox], [], [], AGAIN_S if len(self.handing) else ROUND_S)[0]:
+            with suppress(BlockingIOError):
+                passed = self.gate.take(self._inbox.recv(1 << 16), time.monotonic_ns(), time.time_ns())
+        now_ns = time.monotonic_ns()
+        self.handing.add(passed, now_ns)
+        replies = self.handing.send(self._control.send, now_ns)
+        if passed.reply is not None:
+            replies.append(Reply(passed.reply_to, passed.reply))
+        for path, said in replies:
+            self._reply(Path(path), said)
 
     def _reply(self, where: Path, reply: dict[str, Any]) -> None:
         """To a name in the run folder only: who writes to this loop must not have it write elsewhere."""
-        if where.parent.resolve() == self._run_dir:
+        if where.name and where.parent.resolve() == self._run_dir:
             sender = Sender(where)
             sender.send(json.dumps(reply).encode())
             sender.close()

@@ -30,6 +30,8 @@ class Passed(NamedTuple):
     """For who handed it on: ``{"digest", "refused"}``. What was accepted shows in the log of the session."""
     reply_to: str = ""
     """Path of the socket that wants to hear it."""
+    order: str = ""
+    """Digest of the order that ``news`` is; "" where that is a refusal."""
 
 
 class OrderGate:
@@ -71,7 +73,7 @@ class OrderGate:
             LOG.warning("%s: cannot be written", self._folder / SEQUENCES)
             with suppress(OSError):  # better none than one that is behind
                 (self._folder / SEQUENCES).unlink()
-        return Passed(_order(found.order))
+        return Passed(_order(found.order), None, reply_to, digest(signed))
 
 
 def _order(order: Order) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.link.keys import SEQUENCES, add_key, read_keys
 from dcon.link.orders import SignedOrder, Verifier, digest, sign
-from dcon.link.paths import AIDE, CONTROL, WATCHDOG, prepare
+from dcon.link.paths import AIDE, CONTROL, WATCHDOG, Sender, bind_datagram, prepare, release
 from dcon.platform.aides import GuiAide
 from dcon.platform.order_gate import OrderGate, Passed
 from dcon.server.desk import Desk
@@ -201,6 +201,36 @@ def test_the_server_hears_why_an_order_of_its_operator_was_refused(folder: Path)
             (answer,) = desk.reply(replies.heard[0][1])[:1]
         desk.close()
     assert "replayed" in json.dumps(answer)
+
+
+@pytest.mark.realtime
+def test_an_order_for_which_the_controller_has_no_room_is_tried_again_then_refused(folder: Path) -> None:
+    control = bind_datagram(folder, CONTROL)
+    filler = Sender(folder / CONTROL)
+    with listening(folder, WATCHDOG, REPLIES) as (_, replies):
+        aide = GuiAide(gate(folder, time.time_ns()), folder)
+        with in_thread(aide.run, aide.stop):
+            while filler.send(b"a status"):
+                pass
+            send(folder, AIDE, datagram(signed(folder, time_ns=time.time_ns()), str(folder / REPLIES)))
+            wait_for(lambda: aide.gate.accepted == 1)
+            taken: list[bytes] = []
+
+            def came() -> bool:
+                with suppress(BlockingIOError):
+                    taken.append(control.recv(1 << 16))
+                return taken[-1:] != [] and b'"arm"' in taken[-1]
+
+            wait_for(came)
+            assert replies.heard == []
+            while filler.send(b"a status"):
+                pass
+            late = signed(folder, "disarm", time_ns=time.time_ns())
+            send(folder, AIDE, datagram(late, str(folder / REPLIES)))
+            wait_for(lambda: replies.heard)
+    assert json.loads(replies.heard[0][1]) == {"digest": digest(late), "refused": "the controller did not take it"}
+    filler.close()
+    release(control)
 
 
 @pytest.mark.realtime
