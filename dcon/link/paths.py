@@ -13,8 +13,11 @@ from pmutools.errors import SourceError
 
 WATCHDOG, CONTROL, AIDE, OUTPUT = "watchdog.in", "control.in", "aide.in", "output.in"
 """Datagram sockets."""
+REPLIES = "server.replies"
+"""Where the server hears what became of orders; datagrams."""
 SERVER = "server.in"
 """Sequenced packets: the server listens."""
+NAMES = (WATCHDOG, CONTROL, AIDE, OUTPUT, SERVER, REPLIES)
 LONGEST = 107
 """Bytes of a Unix socket's path."""
 
@@ -29,8 +32,9 @@ def prepare(folder: str | os.PathLike[str]) -> Path:
         raise SourceError(f"run folder {path}: {error.strerror}") from None
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise SourceError(f"run folder {path}: others may enter it; chmod 700 {path}, or take another")
-    if len(os.fsencode(path / WATCHDOG)) > LONGEST:
-        raise SourceError(f"run folder {path}: too long for a socket's name; take one of at most 90 bytes")
+    most = LONGEST - len("/") - max(map(len, NAMES))
+    if len(os.fsencode(path)) > most:
+        raise SourceError(f"run folder {path}: too long for a socket's name; take one of at most {most} bytes")
     return path
 
 
@@ -81,7 +85,7 @@ def _bound(path: Path, kind: int, buffer: int | None) -> socket.socket:
         sock.bind(os.fspath(path))
     except OSError as error:
         sock.close()
-        raise SourceError(f"{path}: {error.strerror}") from None
+        raise SourceError(f"{path}: {error.strerror or error}") from None  # Python's own errors have no strerror
     return sock
 
 

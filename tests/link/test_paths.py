@@ -13,6 +13,7 @@ import pytest
 
 from dcon.link import paths
 from dcon.link.paths import Sender, bind_datagram, is_held, listen, prepare, release
+from dcon.server.server import REPLIES
 from pmutools.errors import SourceError
 
 HOLDER = """
@@ -87,3 +88,15 @@ def test_a_sender_never_waits_and_counts(tmp_path: Path) -> None:
     os.unlink(folder / paths.CONTROL)
     sender.close()
     mine.close()
+
+
+def test_the_longest_folder_that_is_taken_has_room_for_every_name(tmp_path: Path) -> None:
+    assert paths.REPLIES == REPLIES, "the server binds it"
+    most = 107 - 1 - max(map(len, paths.NAMES))
+    folder = tmp_path / ("x" * (most - len(str(tmp_path)) - 1))
+    for name in paths.NAMES:
+        release(bind_datagram(prepare(folder), name))
+    with pytest.raises(SourceError, match=rf"too long for a socket's name; take one of at most {most} bytes"):
+        prepare(f"{folder}y")
+    with pytest.raises(SourceError, match=r"path too long$"):
+        bind_datagram(tmp_path, "x" * 107)
