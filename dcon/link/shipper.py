@@ -122,7 +122,7 @@ class Shipper:
         try:
             said = json.loads(message)
             have = said.get("ack", said.get("have"))
-        except (ValueError, AttributeError):
+        except (ValueError, AttributeError, RecursionError):
             return
         if not isinstance(have, int):
             return

@@ -59,7 +59,7 @@ def hear(heard: Heard, datagram: bytes, now_ns: int) -> Said:
     counted."""
     if (status := decode_status(datagram)) is not None:
         return Said(heard._replace(status=status))
-    if (readback := decode_readback(datagram)) is not None:
+    if (readback := decode_readback(datagram)) is not None and math.isfinite(readback.volts):
         return Said(heard._replace(readback=readback))
     try:
         said = json.loads(datagram)
@@ -69,13 +69,16 @@ def hear(heard: Heard, datagram: bytes, now_ns: int) -> Said:
 
 
 def _gps(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
-    return Said(heard._replace(gps_age_s=_number(said["age_s"]), gps_ns=now_ns))
+    age_s = _number(said["age_s"])
+    if age_s < 0:
+        raise ValueError("a lock from the future")
+    return Said(heard._replace(gps_age_s=age_s, gps_ns=now_ns))
 
 
 def _pdci(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
     scheduled_mw = said.get("scheduled_mw")
     pdci = Pdci(
-        int(said["time_ns"]),
+        _time_ns(said["time_ns"]),
         _number(said["power_mw"]),
         said["in_service"] is True,
         said["dcon_enabled"] is True,
@@ -88,6 +91,7 @@ def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
     name, text, who, why = (said.get(key, "") for key in ("name", "text", "who", "why"))
     if not all(isinstance(word, str) for word in (name, text, who, why)):
         raise TypeError("an order is words")
+    "".join((name, text, who, why)).encode()  # JSON has halves of surrogates, which no log takes
     return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who, why))
 
 
@@ -103,6 +107,13 @@ def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return float(value)
+
+
+def _time_ns(value: object) -> int:
+    """POSIX UTC, as the log can hold it."""
+    if type(value) is not int or not 0 <= value < 1 << 63:
+        raise ValueError(f"{value!r} is no time")
+    return value
 
 
 def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:

@@ -74,7 +74,7 @@ def test_a_server_that_knows_the_session_is_sent_the_rest_and_the_configurations
     assert config is not None and config.entries == (Entry("config", "N1", b"new", 6, 6),)
 
 
-@pytest.mark.parametrize("said", [b"", b"{}", b"[]", b'{"have": "x"}', b'{"ack": 1}', b"\xff"])
+@pytest.mark.parametrize("said", [b"", b"{}", b"[]", b'{"have": "x"}', b'{"ack": 1}', b"\xff", b"[" * 100_000])
 def test_words_without_sense_change_nothing(said: bytes) -> None:
     made, wire = shipper(), Wire()
     filled(made, 3)

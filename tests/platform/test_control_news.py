@@ -7,13 +7,13 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, encode_readback
 from dcon.platform.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, surroundings, watchdog_of
-from dcon.session.codec import Watchdog
+from dcon.session.codec import Watchdog, encode_order, encode_pdci, encode_surroundings
 from dcon.watchdog.codec import encode_status
 
 T0 = 10**12
@@ -127,7 +127,16 @@ def test_the_relays_are_as_the_watchdog_says_as_long_as_it_speaks(relays: int, c
     assert told(said, at=T0 + STATUS_NS + 1).relays_closed is None
 
 
+LINE = {"kind": "pdci", "power_mw": 0, "in_service": True, "dcon_enabled": True}
 BAD = [
+    *(
+        json.dumps({**LINE, "time_ns": time_ns}).encode()
+        for time_ns in (1 << 63, -1, -(1 << 80), 1e18, "7", True, None)
+    ),
+    *(json.dumps({"kind": "order", "name": "arm", word: "\ud800"}).encode() for word in ("name", "text", "who", "why")),
+    encode_readback(Readback(1, T0, math.nan)),
+    json.dumps({"kind": "gps", "age_s": -1.0}).encode(),
+    b'{"kind":"order","name":"gain","value":1' + 400 * b"0" + b"}",
     b"",
     b"{}",
     b"[]",
@@ -155,6 +164,27 @@ def test_what_makes_no_sense_is_counted_and_changes_nothing(datagram: bytes) -> 
     before = heard((T0, status(T0)), (T0, SERVER))
     after, order = hear(before, datagram, T0)
     assert after == before._replace(ignored=1) and order is None
+
+
+VALUES = st.integers() | st.floats() | st.text() | st.booleans() | st.none() | st.sampled_from([1 << 63, (1 << 63) - 1])
+KEYS = ("time_ns", "power_mw", "scheduled_mw", "in_service", "dcon_enabled", "age_s", "name", "value", "text", "who")
+SAID = st.builds(
+    lambda kind, said: {"kind": kind, **said},
+    st.sampled_from(["gps", "pdci", "order", "server"]),
+    st.fixed_dictionaries({}, optional=dict.fromkeys((*KEYS, *SERVER), VALUES)),
+)
+
+
+@given(SAID)
+@example({**LINE, "time_ns": (1 << 63) - 1})
+def test_whatever_is_taken_in_can_be_logged(said: dict[str, Any]) -> None:
+    now, order = hear(Heard(T0), json.dumps(said).encode(), T0)
+    around = surroundings(now, T0 + S, 0)
+    encode_surroundings(T0, around)
+    if around.pdci is not None:
+        encode_pdci(T0, around.pdci)
+    if order is not None:
+        encode_order(T0, order)
 
 
 @given(
