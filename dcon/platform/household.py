@@ -165,13 +165,28 @@ class Household:
     # --- starting
 
     def _start(self, each: _Running) -> None:
+        """Raises SourceError where the system has no room for one more."""
         out = subprocess.PIPE if each.member is PLATFORM else subprocess.DEVNULL
         environment = {key: value for key, value in os.environ.items() if key != "NOTIFY_SOCKET"}
         command = self._commands[each.member.name]()
-        each.process = launch(command, dies_by=signal.SIGTERM, stdout=out, env=environment)
-        each.pidfd = os.pidfd_open(each.process.pid)
         each.started_s = time.monotonic()
+        try:
+            each.process = launch(command, dies_by=signal.SIGTERM, stdout=out, env=environment)
+            each.pidfd = os.pidfd_open(each.process.pid)
+        except (OSError, subprocess.SubprocessError) as error:
+            self._abandon(each)
+            reason = getattr(error, "strerror", None) or error
+            raise SourceError(f"the {each.member.name} process could not be started, {reason}") from None
         self._poll.register(each.pidfd, select.POLLIN)
+
+    def _abandon(self, each: _Running) -> None:
+        """End one that nobody could look after."""
+        process, each.process = each.process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
 
     def _became_ready(self, each: _Running) -> bool:
         """Wait until it has its socket; false where the end was asked for meanwhile."""
@@ -201,22 +216,28 @@ class Household:
             if each.process is not None and each.process.poll() is not None:
                 self._bury(each)
             elif each.process is None and time.monotonic() >= each.again_s and not self.stopping:
-                self._start(each)
+                try:
+                    self._start(each)
+                except SourceError as error:
+                    self._put_off(each, str(error))
         missing = [name for name, each in self._running.items() if each.process is None]
         self._notifier.tell(ALIVE, status=f"waiting to restart {', '.join(missing)}" if missing else "running")
 
     def _bury(self, each: _Running) -> None:
         """It has ended: is that the end of the run, or when is it to be started again?"""
         code = self._close(each)
-        name = each.member.name
         if each.member is PLATFORM and (code in DONE or code == USAGE or self._is_over()):
             self._over = True
             return
-        ran_s = time.monotonic() - each.started_s
-        each.backoff, wait_s = each.backoff.ended(ran_s)
-        each.again_s = time.monotonic() + wait_s
+        self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
+
+    def _put_off(self, each: _Running, why: str) -> None:
+        """It does not run: start it again, the later the more often that has happened."""
+        now_s, name = time.monotonic(), each.member.name
+        each.backoff, wait_s = each.backoff.ended(now_s - each.started_s)
+        each.again_s = now_s + wait_s
         self.outcome.restarts[name] = self.outcome.restarts.get(name, 0) + 1
-        LOG.warning("the %s process has ended, %s; started again in %g s", name, ending(code), wait_s)
+        LOG.warning("%s; started again in %g s", why, wait_s)
 
     def _close(self, each: _Running) -> int:
         process = each.process

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -12,11 +13,13 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, bind_datagram, prepare
+from dcon.platform import household
 from dcon.platform.household import ENDED, STARTED, Household
 from pmutools.errors import SourceError
 
@@ -133,6 +136,43 @@ def test_a_controller_that_was_set_up_wrongly_is_not_started_again(tmp_path: Pat
     house.lives["platform"] = [(0.3, 2)]
     assert house.household.run().code == 2
     assert house.events("start") == ["watchdog", "server", "platform"]
+
+
+@pytest.mark.parametrize("call", ["fork", "pidfd"])
+def test_a_system_without_room_for_a_process_is_asked_again_later(
+    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    house = House(tmp_path)
+    house.lives["server"] = [(0.2, 1), (60, 0)]
+    refused: list[int] = []
+    where, name = {"fork": (household, "launch"), "pidfd": (os, "pidfd_open")}[call]
+    right = getattr(where, name)
+
+    def scarce(*given: Any, **named: Any) -> Any:
+        if house.events("start").count("platform") and len(refused) < 2:
+            refused.append(1)
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return right(*given, **named)
+
+    monkeypatch.setattr(where, name, scarce)
+    house.stop_when(lambda: len(refused) == 2 and house.events("start").count("server") >= 2)
+    outcome = house.household.run()
+    assert outcome.restarts == {"server": 3} and len(refused) == 2
+    assert "the server process could not be started, Resource temporarily unavailable" in caplog.text
+    assert house.is_empty()
+
+
+def test_one_for_which_there_is_no_room_at_the_start_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*given: Any, **named: Any) -> Any:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    house = House(tmp_path)
+    monkeypatch.setattr(os, "pidfd_open", full)
+    with pytest.raises(SourceError, match=r"^the watchdog process could not be started, Too many open files$"):
+        house.household.run()
+    assert house.is_empty()
 
 
 def test_one_that_cannot_start_ends_the_others_in_one_line(tmp_path: Path) -> None:
