@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dcon.demo.course import Course
 from dcon.demo.judge import read_traces, summarise
@@ -38,6 +38,8 @@ WHOLE = sys.platform == "linux"
 """All processes of the platform; elsewhere the controller is alone, and its orders are given beforehand."""
 ENDED = 130
 """Exit code of ``dcon run`` that was asked to end."""
+LAST_BYTES = 1 << 14
+"""Of what a process has said, as much is looked at for its last line."""
 WHO = "demo"
 PATIENT = "\n".join(
     f"{key} = 1000"
@@ -92,7 +94,7 @@ class Site:
 
     ini: Path
     work: Path
-    """Of files that are gone after the run: the operator's key, sockets, the watchdog's log."""
+    """Of files that are gone after the run: the operator's key, sockets, the watchdog's log, what the processes say."""
     command_port: int
     status_port: int
     pmu_port: int
@@ -184,20 +186,20 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _perform(demo: Demo, site: Site, tell: Callable[[str, float], None]) -> dict[str, Any]:
     course = demo.course
-    processes: dict[str, subprocess.Popen[str]] = {}
+    processes: dict[str, Child] = {}
     try:
         start_ns = _second_zero()
-        processes["controller"] = _launch(_controller(demo, site, start_ns))
+        processes["controller"] = _launch(_controller(demo, site, start_ns), site.work / "controller.txt")
         if WHOLE:
             _await_controller(processes["controller"], site)
             start_ns = _second_zero()
-        processes["grid"] = _launch(_grid(demo, site, start_ns))
+        processes["grid"] = _launch(_grid(demo, site, start_ns), site.work / "grid.txt")
         _wait(processes, start_ns, course, tell, _operator(site) if WHOLE else None)
     finally:
-        for process in processes.values():
+        for process, _ in processes.values():
             if process.poll() is None:
                 process.terminate()
-        for process in processes.values():
+        for process, _ in processes.values():
             _reap(process)
     tell("reading the session log", course.end_s)
     return report(demo, start_ns)
@@ -207,12 +209,12 @@ def _second_zero() -> int:
     return (time.time_ns() // timebase.NS + 1) * timebase.NS + round(LEAD_S * timebase.NS)
 
 
-def _await_controller(process: subprocess.Popen[str], site: Site) -> None:
+def _await_controller(child: Child, site: Site) -> None:
     """Until the server has heard a tick; raises DemoError where that does not happen."""
     end_s = time.monotonic() + READY_S
     while time.monotonic() < end_s:
-        if process.poll() is not None:
-            raise DemoError(f"the controller process failed: {_last_words(process)}")
+        if child.process.poll() is not None:
+            raise DemoError(f"the controller process failed: {_last_words(child)}")
         with suppress(SourceError), Client(site.server) as client:
             if client.ask({"ask": "status"})["state"] is not None:
                 return
@@ -275,13 +277,22 @@ def _grid(demo: Demo, site: Site, start_ns: int) -> list[str]:
     ]
 
 
-def _launch(arguments: list[str]) -> subprocess.Popen[str]:
+class Child(NamedTuple):
+    """A process of the demo."""
+
+    process: subprocess.Popen[bytes]
+    said: Path
+    """What it writes to its standard error: a file, so that it never waits for somebody to read."""
+
+
+def _launch(arguments: list[str], said: Path) -> Child:
     quiet = subprocess.DEVNULL
-    return subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
+    with said.open("ab") as file:
+        return Child(subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=file), said)
 
 
 def _wait(
-    processes: dict[str, subprocess.Popen[str]],
+    processes: dict[str, Child],
     start_ns: int,
     course: Course,
     tell: Callable[[str, float], None],
@@ -291,7 +302,7 @@ def _wait(
     said = ""
     deadline_ns = start_ns + round((course.end_s + GRACE_S) * timebase.NS)
     orders = deque(course.orders if give is not None else ())
-    while any(process.poll() is None for process in processes.values()):
+    while any(process.poll() is None for process, _ in processes.values()):
         _check(processes)
         now_ns = time.time_ns()
         if now_ns > deadline_ns:
@@ -303,7 +314,7 @@ def _wait(
             tell(text, seconds)
         if give is not None and not orders and seconds >= course.end_s:
             give = None
-            processes["controller"].terminate()
+            processes["controller"].process.terminate()
         if give is not None and orders and now_ns - start_ns >= orders[0].at_ns:
             give(orders.popleft().order.name)
             continue
@@ -311,11 +322,11 @@ def _wait(
     _check(processes)
 
 
-def _check(processes: dict[str, subprocess.Popen[str]]) -> None:
+def _check(processes: dict[str, Child]) -> None:
     """Raises DemoError where one has failed."""
-    for name, process in processes.items():
-        if process.poll() not in (None, 0, ENDED if name == "controller" and WHOLE else 0):
-            raise DemoError(f"the {name} process failed: {_last_words(process)}")
+    for name, child in processes.items():
+        if child.process.poll() not in (None, 0, ENDED if name == "controller" and WHOLE else 0):
+            raise DemoError(f"the {name} process failed: {_last_words(child)}")
 
 
 def phase(course: Course, seconds: float) -> str:
@@ -331,17 +342,16 @@ def phase(course: Course, seconds: float) -> str:
     return next(text for until_s, text in table if seconds < until_s)
 
 
-def _last_words(process: subprocess.Popen[str]) -> str:
-    said = process.stderr.read() if process.stderr is not None else ""
-    lines = [line for line in said.splitlines() if line.strip()]
-    return lines[-1] if lines else f"exit code {process.returncode}"
+def _last_words(child: Child) -> str:
+    with child.said.open("rb") as file:
+        file.seek(max(0, child.said.stat().st_size - LAST_BYTES))
+        lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else f"exit code {child.process.returncode}"
 
 
-def _reap(process: subprocess.Popen[str]) -> None:
+def _reap(process: subprocess.Popen[bytes]) -> None:
     try:
         process.wait(END_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    if process.stderr is not None:
-        process.stderr.close()

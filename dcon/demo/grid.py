@@ -76,7 +76,7 @@ class LiveGrid:
             self.handles.append(handle)
             names = (str(pmu.idcode), pmu.bus)
             self.pipelines.append(Pipeline(faults, pmu.name, seed, config=stream.config, aliases=names))
-        self.last_sequence = -1
+        self.last_sequence: int | None = None
         self.last_command_ns = 0
         self.status_to: socket.socket | None = None
         if status_port is not None:
@@ -124,7 +124,8 @@ class LiveGrid:
     def _take_commands(self) -> None:
         for chunk in self.inbox.read():
             command = udp_command.decode(chunk.data)
-            if command is None or command.sequence <= self.last_sequence:
+            last = self.last_sequence
+            if command is None or (last is not None and not udp_command.follows(command.sequence, last)):
                 continue
             self.last_sequence = command.sequence
             self.last_command_ns = chunk.arrival_ns or command.time_ns
@@ -140,8 +141,8 @@ class LiveGrid:
 
     def _silence(self, now_ns: int) -> None:
         """The line goes back to its schedule, and the next to command may begin its sequence anew."""
-        if self.last_sequence >= 0 and now_ns - self.last_command_ns > SILENCE_NS:
-            self.last_sequence = -1
+        if self.last_sequence is not None and now_ns - self.last_command_ns > SILENCE_NS:
+            self.last_sequence = None
             self.grid.command(0.0, now_ns)
 
     def close(self) -> None:

@@ -191,6 +191,11 @@ def test_the_grid_takes_good_commands_in_sequence_and_forgets_a_silent_controlle
             grid.grid.advance(grid.last_command_ns + SILENCE_NS + NS)
             assert grid.grid.command_mw == 0.0
             assert applied(encode(CommandOut(0, 0, 10.0, 0.8))) == 10.0  # a controller that was started anew
+            grid._silence(grid.last_command_ns + SILENCE_NS + 1)
+            grid.grid.advance(grid.last_command_ns + SILENCE_NS + NS)
+            assert applied(encode(CommandOut((1 << 32) - 1, 0, 30.0, 2.4))) == 30.0
+            assert applied(encode(CommandOut(0, 0, 20.0, 1.6))) == 20.0  # the number wraps
+            assert applied(encode(CommandOut((1 << 32) - 1, 0, 30.0, 2.4))) == 20.0
         finally:
             grid.close()
 
@@ -240,11 +245,11 @@ LONG = ["-c", "import time; time.sleep(60)"]
 def test_a_child_that_fails_is_told_and_the_other_is_ended(
     who: str, failing: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[subprocess.Popen[str]] = []
+    started: list[conductor.Child] = []
     launch = conductor._launch
 
-    def launched(arguments: list[str]) -> subprocess.Popen[str]:
-        started.append(launch(arguments))
+    def launched(arguments: list[str], said: Path) -> conductor.Child:
+        started.append(launch(arguments, said))
         return started[-1]
 
     monkeypatch.setattr(conductor, "_launch", launched)
@@ -255,7 +260,15 @@ def test_a_child_that_fails_is_told_and_the_other_is_ended(
     with pytest.raises(DemoError, match=rf"^the {who} process failed: .*{said}$"):
         perform(Demo(tmp_path, course=SHORT))
     assert time.monotonic() - began < 4  # it was asked to end, not waited for
-    assert len(started) == 2 and all(process.poll() is not None for process in started)
+    assert len(started) == 2 and all(child.process.poll() is not None for child in started)
+
+
+@pytest.mark.realtime
+def test_a_child_that_says_much_is_not_held_up_and_its_last_words_are_told(tmp_path: Path) -> None:
+    script = "import sys; [print('warning', 'x' * 1000, file=sys.stderr) for _ in range(500)]; sys.exit('last words')"
+    child = conductor._launch(["-c", script], tmp_path / "said.txt")
+    assert child.process.wait(20) == 1
+    assert conductor._last_words(child) == "last words"
 
 
 @pytest.mark.realtime
