@@ -8,7 +8,10 @@ from typing import NamedTuple
 from dcon.core.system import ORDERS
 from dcon.core.values import Order
 from pmutools.errors import SettingsError
-from pmutools.parsers import suggestion
+from pmutools.parsers import number, suggestion
+
+LONGEST_S = 1e9
+"""An order is no further from the start: 30 years."""
 
 
 class TimedOrder(NamedTuple):
@@ -22,9 +25,9 @@ def parse_order(text: str) -> TimedOrder:
     when, colon, rest = text.partition(":")
     name, equals, value = rest.partition("=")
     try:
-        at_ns = round(float(when) * 1e9)
-        amount = float(value) if equals else 0.0
-    except (ValueError, OverflowError):
+        at_ns = round(number(-LONGEST_S, LONGEST_S)(when) * 1e9)
+        amount = number()(value) if equals else 0.0
+    except ValueError:
         colon = ""
         at_ns, amount = 0, 0.0
     if not colon:

@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dcon.cli.ctl import LOOKS, VERBS
+from dcon.core.system import ORDERS
 from dcon.core.values import Order
 from dcon.platform.orders import OrderBook, TimedOrder, parse_order
 from dcon.platform.schedule import TickGrid
@@ -65,6 +67,11 @@ def test_an_order(text: str, order: TimedOrder) -> None:
         ("nan:arm", "write SECONDS:NAME"),
         ("inf:arm", "write SECONDS:NAME"),
         ("1:gain=x", "write SECONDS:NAME"),
+        ("1:gain=nan", "write SECONDS:NAME"),
+        ("1:gain=inf", "write SECONDS:NAME"),
+        ("1:gain=1_0", "write SECONDS:NAME"),
+        ("1_0:arm", "write SECONDS:NAME"),
+        ("1e300:arm", "write SECONDS:NAME"),
         ("1:amr", "--order 1:amr: 'amr' is no order; did you mean 'arm'?"),
         ("1:", "'' is no order; known: start, off, arm"),
         ("1:gain", "--order 1:gain: no value; write 1:gain=MW_PER_MHZ"),
@@ -75,6 +82,10 @@ def test_an_order_that_is_none_is_one_line(text: str, said: str) -> None:
     with pytest.raises(SettingsError, match=r"^[^\n]*$") as caught:
         parse_order(text)
     assert said in str(caught.value)
+
+
+def test_an_operator_can_give_every_order_there_is() -> None:
+    assert sorted({*VERBS} - {*LOOKS}) == sorted(map(str, ORDERS))
 
 
 def test_orders_are_handed_out_once_in_time_and_in_the_order_given() -> None:
