@@ -32,7 +32,6 @@ from pmutools.clock import Clock, SystemClock
 from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
-REPLIES = "server.replies"
 BEAT_NS = NS // 10
 NEWS_NS = NS // 2
 BREATH_NS = NS // 100
@@ -72,13 +71,13 @@ class Server:
         """Messages on the controller's socket that are no bundles, and heads that say nothing."""
         self._selector = selectors.DefaultSelector()
         self._listener = paths.listen(self.folder, paths.SERVER)
-        self._replies = paths.bind_datagram(self.folder, REPLIES)
+        self._replies = paths.bind_datagram(self.folder, paths.REPLIES)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
         self._watchdog = Sender(self.folder / paths.WATCHDOG)
         self._control = Sender(self.folder / paths.CONTROL)
         self.desk = Desk(self.folder, self.status, verifier)
-        self.desk.reply_to = str(self.folder / REPLIES)
+        self.desk.reply_to = str(self.folder / paths.REPLIES)
         self.operators = Operators(settings.server.listen, self.desk, self._selector)
         self._connections: list[socket.socket] = []
         self._source: socket.socket | None = None

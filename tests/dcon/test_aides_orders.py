@@ -22,11 +22,10 @@ from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.link.keys import SEQUENCES, add_key, read_keys
 from dcon.link.orders import SignedOrder, Verifier, digest, sign
-from dcon.link.paths import AIDE, CONTROL, WATCHDOG, Sender, bind_datagram, prepare, release
+from dcon.link.paths import AIDE, CONTROL, REPLIES, WATCHDOG, Sender, bind_datagram, prepare, release
 from dcon.platform.aides import GuiAide
 from dcon.platform.order_gate import OrderGate, Passed
 from dcon.server.desk import Desk
-from dcon.server.server import REPLIES
 from pmutools.errors import SourceError
 from pmutools.timebase import NS
 

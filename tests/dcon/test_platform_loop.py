@@ -17,7 +17,7 @@ from dcon.limiter import SLEW_MW_PER_S
 from dcon.platform.loop import EARLY_NS, TOLD
 from dcon.platform.orders import parse_order
 from dcon.platform.waiting import CONFIGS
-from dcon.session.log import SessionReader
+from dcon.session.reader import SessionReader
 from dcon.session.replay import identical
 from pmutools.c37118 import StreamConfig
 from pmutools.errors import SettingsError

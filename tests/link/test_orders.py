@@ -62,8 +62,9 @@ def test_any_flipped_bit_is_refused(given_: SignedOrder, data: st.DataObject) ->
 def test_any_changed_field_is_refused(given_: SignedOrder, data: st.DataObject) -> None:
     said = json.loads(sign(given_, KEY))
     other = json.loads(sign(data.draw(ORDER), KEY))
-    name = data.draw(st.sampled_from(SignedOrder._fields))
-    assume(said[name] != other[name])
+    changed = [name for name in SignedOrder._fields if said[name] != other[name]]
+    assume(changed)
+    name = data.draw(st.sampled_from(changed))
     said[name] = other[name]
     forged = json.dumps(said, sort_keys=True, separators=(",", ":")).encode()
     assert verified(forged) == Refused("the signature does not hold", "Ada")
