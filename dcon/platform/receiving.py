@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from dcon.link.crossing import Counts, Item, PmuFrameIn
-from pmutools.c37118 import FrameType, Loss, Message, StreamConfig, decode_config
-from pmutools.c37118.config import encode_config
-from pmutools.errors import EncodeError, WireError
+from pmutools.c37118 import FrameType, Loss, Message, StreamConfig
+from pmutools.c37118.config import whole
+from pmutools.c37118.constants import MAX_FRAME_SIZE
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.receiver import Receivers
@@ -59,30 +59,17 @@ class Reception:
                 take(self._handed_on(owner, message, config))
 
     def _handed_on(self, owner: int, message: Message, config: StreamConfig) -> Item:
-        """The configuration in one frame; where none has room for it, that it is refused."""
+        """The whole configuration; where it is longer than a frame can be, that it is refused."""
         frame, flow, _ = message
-        try:
-            whole = _whole(frame.data, config)
-        except EncodeError as error:
+        data = whole(frame.data, config)
+        if len(data) > MAX_FRAME_SIZE:
             self._refused.add(owner)
             self.counts.undecodable += 1
             where = f"{flow.transport}://{flow.source}"
-            return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), f"{error}; it is refused", frame.idcode, flow)
+            why = f"its configuration takes {len(data)} bytes, which is more than the {MAX_FRAME_SIZE} of a frame"
+            return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), f"{why}; it is refused", frame.idcode, flow)
         self._refused.discard(owner)
-        return PmuFrameIn(owner, frame._replace(data=whole), is_config=True)
+        return PmuFrameIn(owner, frame._replace(data=data), is_config=True)
 
     def close(self) -> None:
         self.receivers.close()
-
-
-def _whole(data: bytes, config: StreamConfig) -> bytes:
-    """A frame that says ``config`` by itself: that which came, unless it was the last of several.
-
-    Raises EncodeError where those were more than fits into one.
-    """
-    try:
-        if decode_config(data)[1] == config:
-            return data
-    except WireError:
-        pass
-    return encode_config(config)

@@ -23,6 +23,7 @@ from pmutools.c37118.constants import (
     FNOM_50_HZ,
     LABELS_PER_WORD,
     MAX_FRAME_SIZE,
+    MIN_FRAME_SIZE,
     NAME_SIZE,
     PHSCALE_CURRENT,
     PREFIX_SIZE,
@@ -33,6 +34,8 @@ from pmutools.c37118.constants import (
 from pmutools.c37118.prefix import Prefix, encode_prefix, verified
 from pmutools.errors import ConfigError, EncodeError
 
+FIRST_FRAGMENT, LAST_FRAGMENT = 1, 0xFFFF
+"""CONT_IDX of a CFG-3 in several frames; it is 0 of one in a single frame."""
 PhasorKind = Literal["V", "I"]
 
 
@@ -194,18 +197,44 @@ class StreamConfig:
 
 
 def decode_config(frame: bytes) -> tuple[Prefix, StreamConfig]:
-    """Decode a CFG-1, CFG-2 or CFG-3 frame.
+    """Decode a CFG-1, CFG-2 or CFG-3 frame, or all fragments of a CFG-3 end to end; the prefix is the first one's.
 
     Raises
     ------
     WireError
-        Not a configuration frame, wrong CHK or FRAMESIZE, counts that do not fill the frame, TIME_BASE 0, or one
-        fragment of a CFG-3 that was sent in several frames.
+        Not a configuration frame, wrong CHK or FRAMESIZE, counts that do not fill the frame, TIME_BASE 0, or not all
+        fragments of a CFG-3 that was sent in several frames.
     """
-    prefix = verified(frame)
+    first, *more = frames_in(frame)
+    prefix = verified(first)
     if not prefix.type.is_config:
         raise ConfigError(f"a {prefix.type.name} frame is no configuration", idcode=prefix.idcode)
-    return prefix, decode_config_body(prefix, frame[PREFIX_SIZE:-CHK_SIZE])
+    body = first[PREFIX_SIZE:-CHK_SIZE]
+    if more:
+        if any((other.sync, other.idcode) != (prefix.sync, prefix.idcode) for other in map(verified, more)):
+            raise ConfigError("frames of several kinds or IDCODEs", idcode=prefix.idcode)
+        parts = [each[PREFIX_SIZE:-CHK_SIZE] for each in (first, *more)]
+        if [int.from_bytes(part[:2], "big") for part in parts] != [*range(FIRST_FRAGMENT, len(parts)), LAST_FRAGMENT]:
+            raise ConfigError("fragments of a CFG-3 that do not follow each other", idcode=prefix.idcode)
+        body = b"\0\0" + b"".join(part[2:] for part in parts)
+    return prefix, decode_config_body(prefix, body)
+
+
+def whole(frame: bytes, config: StreamConfig) -> bytes:
+    """What says ``config`` by itself: the frame that it came with, or all fragments, where that is one of them."""
+    is_fragment = config.kind is FrameType.CFG3 and frame[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0"
+    return encode_config(config) if is_fragment else frame
+
+
+def frames_in(data: bytes) -> list[bytes]:
+    """What :func:`encode_config` gives, frame by frame; one that is cut short or senseless is the last."""
+    frames, at = list[bytes](), 0
+    while at < len(data) or not frames:
+        size = int.from_bytes(data[at + 2 : at + 4], "big")
+        end = at + size if size >= MIN_FRAME_SIZE and data[at + size : at + size + 1] == data[:1] else len(data)
+        frames.append(data[at:end])
+        at = end
+    return frames
 
 
 def decode_config_body(prefix: Prefix, body: bytes) -> StreamConfig:
@@ -240,16 +269,29 @@ def decode_config_body(prefix: Prefix, body: bytes) -> StreamConfig:
 def encode_config(config: StreamConfig, *, soc: int = 0, fracsec: int = 0, time_quality: int = 0) -> bytes:
     """The configuration frame of ``config.kind``, stamped with its time of transmission.
 
+    A CFG-3 that is longer than a frame can be is cut into fragments (CONT_IDX), end to end: :func:`frames_in`.
+
     Raises
     ------
     EncodeError
-        A name, count or value that the frame cannot carry, or more than 65535 bytes.
+        A name, count or value that the frame cannot carry, or more than 65535 bytes of a CFG-1 or CFG-2.
     """
-    size = PREFIX_SIZE + len(config.body) + CHK_SIZE
-    if size > MAX_FRAME_SIZE:
-        raise EncodeError(f"configuration of {config.idcode} takes {size} bytes, FRAMESIZE ends at {MAX_FRAME_SIZE}")
     sync = config.kind.sync & 0xFFF0 | config.version
-    return sealed(encode_prefix(Prefix(sync, size, config.idcode, soc, time_quality, fracsec)) + config.body)
+    body, room = config.body, MAX_FRAME_SIZE - PREFIX_SIZE - CHK_SIZE
+    bodies = [body]
+    if len(body) > room:
+        size = PREFIX_SIZE + len(body) + CHK_SIZE
+        if config.kind is not FrameType.CFG3:
+            raise EncodeError(
+                f"configuration of {config.idcode} takes {size} bytes, FRAMESIZE ends at {MAX_FRAME_SIZE}"
+            )
+        parts = [body[at : at + room - 2] for at in range(2, len(body), room - 2)]
+        indices = (*range(FIRST_FRAGMENT, len(parts)), LAST_FRAGMENT)
+        bodies = [index.to_bytes(2, "big") + part for index, part in zip(indices, parts, strict=True)]
+    prefix = Prefix(sync, 0, config.idcode, soc, time_quality, fracsec)
+    return b"".join(
+        sealed(encode_prefix(prefix._replace(framesize=PREFIX_SIZE + len(each) + CHK_SIZE)) + each) for each in bodies
+    )
 
 
 # --- reading ----------------------------------------------------------------------------------------------------

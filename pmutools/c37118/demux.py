@@ -18,7 +18,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 from pmutools.c37118.checksum import chk_array
-from pmutools.c37118.config import StreamConfig, decode_config, decode_config_body
+from pmutools.c37118.config import (
+    FIRST_FRAGMENT,
+    LAST_FRAGMENT,
+    StreamConfig,
+    decode_config,
+    decode_config_body,
+)
 from pmutools.c37118.config_kinds import abridges
 from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
 from pmutools.c37118.framer import Frame, Framer, Skipped, SkipReason
@@ -31,7 +37,6 @@ ALL_HELD_BYTES = 64 << 20
 FRAGMENT_BYTES = 1 << 20
 FLOWS = 1 << 16
 """Flows remembered at once; when another comes (a flood of spoofed sources), one is ended that has long been silent."""
-_FIRST_FRAGMENT, _LAST_FRAGMENT = 1, 0xFFFF
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 _DATA = FrameType.DATA  # looking a member up takes longer than most of what is done with it
 
@@ -463,10 +468,10 @@ class Demux:
         prefix = decode_prefix(frame.data)
         index = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + 2], "big")
         part = frame.data[PREFIX_SIZE + 2 : -CHK_SIZE]
-        expected, body = state.fragments.pop(prefix.idcode, (_FIRST_FRAGMENT, bytearray()))
-        if index == _FIRST_FRAGMENT:
-            expected, body = _FIRST_FRAGMENT, bytearray()
-        last = index == _LAST_FRAGMENT
+        expected, body = state.fragments.pop(prefix.idcode, (FIRST_FRAGMENT, bytearray()))
+        if index == FIRST_FRAGMENT:
+            expected, body = FIRST_FRAGMENT, bytearray()
+        last = index == LAST_FRAGMENT
         if (index != expected and not (last and body)) or len(body) + len(part) > FRAGMENT_BYTES:
             return None
         body += part

@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, encode_batch
-from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config, frames_in
 from pmutools.c37118.demux import Message
 from pmutools.errors import SourceError
 from pmutools.flow import Chunk, Flow, Train
@@ -67,8 +67,8 @@ class Journal:
         if self._shown.get(key) != (flow, batch.config):
             self._shown[key] = flow, batch.config
             arrival = batch.arrival_ns[:1].astype("<i8").tobytes()
-            frame = encode_config(batch.config)
-            self._rows.append((*flow, len(frame), frame, arrival, int(batch.stamp_source[0])))
+            for frame in frames_in(encode_config(batch.config)):
+                self._rows.append((*flow, len(frame), frame, arrival, int(batch.stamp_source[0])))
         size, sources = batch.config.frame_size, batch.stamp_source
         octets = (batch.wire if batch.wire is not None else encode_batch(batch)[0]).tobytes()
         arrivals = batch.arrival_ns.astype("<i8").tobytes()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config, whole
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import Message
 from pmutools.c37118.framer import Frame
@@ -73,7 +73,7 @@ class LogSink(FrameSink):
         if name is None:
             name = self._names[key] = unique([_name(config)], [*self._names.values(), *self._undecoded.values()])[0]
         if frame.type.is_config:
-            self._topics.config(name, frame.data, frame.arrival_ns or 0)
+            self._topics.config(name, whole(frame.data, config), frame.arrival_ns or 0)
             if frame.type.rules_data:
                 self._configs[key] = config
             return

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from pmutools.c37118.batch import NO_TIME, STAMP_SOURCES, Batch, decode_batch, encode_batch
-from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config, frames_in
 from pmutools.c37118.constants import FrameType
 from pmutools.c37118.demux import DataRun, Demux, Loss, Message, Tally
 from pmutools.c37118.framer import Frame
@@ -139,8 +139,10 @@ def frames_of(block: Block, shown: dict[tuple[Flow, int], StreamConfig]) -> Iter
     if shown.get((flow, config.idcode)) != config:
         shown[flow, config.idcode] = config
         soc, fracsec = from_ns(int(batch.time_ns[0]), config.time_base)
-        frame = Frame(encode_config(config, soc=soc, fracsec=fracsec), arrivals[0], STAMP_SOURCES[sources[0]], 0)
-        yield Message(frame, flow, config)
+        frames = frames_in(encode_config(config, soc=soc, fracsec=fracsec))
+        for number, data in enumerate(frames, 1):
+            frame = Frame(data, arrivals[0], STAMP_SOURCES[sources[0]], 0)
+            yield Message(frame, flow, config if number == len(frames) else None)
     for row, arrival in enumerate(arrivals):
         data = raw[row * size : (row + 1) * size]
         yield Message(Frame(data, arrival, STAMP_SOURCES[sources[row]], row * size), flow, config)

@@ -59,7 +59,7 @@ def test_one_longer_than_a_frame_is_refused_and_told_and_its_data_are_no_more_re
     assert [getattr(item, "is_config", None) for item in rig(encode_config(short), data)] == [True, False]
     (event,) = rig(*fragments(long_config()))
     assert isinstance(event, LinkEvent) and event.kind is LinkKind.NO_CONFIG and event.owners == (0,)
-    assert "bytes, FRAMESIZE ends at 65535" in event.detail
+    assert "bytes, which is more than the 65535 of a frame; it is refused" in event.detail
     assert rig.reception.counts.undecodable == 1
     assert rig(*fragments(long_config())) == [], "said once"
     long_data = bytearray(data[:2] + long_config().frame_size.to_bytes(2, "big") + data[4:14])
