@@ -36,6 +36,8 @@ from pmutools.errors import ConfigError, EncodeError
 
 FIRST_FRAGMENT, LAST_FRAGMENT = 1, 0xFFFF
 """CONT_IDX of a CFG-3 in several frames; it is 0 of one in a single frame."""
+FRAGMENT_SIZE = 65_507
+"""Of a frame of several at most: a UDP datagram holds no more."""
 PhasorKind = Literal["V", "I"]
 
 
@@ -277,21 +279,19 @@ def encode_config(config: StreamConfig, *, soc: int = 0, fracsec: int = 0, time_
         A name, count or value that the frame cannot carry, or more than 65535 bytes of a CFG-1 or CFG-2.
     """
     sync = config.kind.sync & 0xFFF0 | config.version
-    body, room = config.body, MAX_FRAME_SIZE - PREFIX_SIZE - CHK_SIZE
+    body, around = config.body, PREFIX_SIZE + CHK_SIZE
     bodies = [body]
-    if len(body) > room:
-        size = PREFIX_SIZE + len(body) + CHK_SIZE
+    if (size := len(body) + around) > MAX_FRAME_SIZE:
         if config.kind is not FrameType.CFG3:
             raise EncodeError(
                 f"configuration of {config.idcode} takes {size} bytes, FRAMESIZE ends at {MAX_FRAME_SIZE}"
             )
-        parts = [body[at : at + room - 2] for at in range(2, len(body), room - 2)]
+        step = FRAGMENT_SIZE - around - 2
+        parts = [body[at : at + step] for at in range(2, len(body), step)]
         indices = (*range(FIRST_FRAGMENT, len(parts)), LAST_FRAGMENT)
         bodies = [index.to_bytes(2, "big") + part for index, part in zip(indices, parts, strict=True)]
     prefix = Prefix(sync, 0, config.idcode, soc, time_quality, fracsec)
-    return b"".join(
-        sealed(encode_prefix(prefix._replace(framesize=PREFIX_SIZE + len(each) + CHK_SIZE)) + each) for each in bodies
-    )
+    return b"".join(sealed(encode_prefix(prefix._replace(framesize=len(each) + around)) + each) for each in bodies)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
