@@ -1,6 +1,7 @@
 """pyc37 as a PMU: ``python pyc37_pmu.py '{"port": ..., "config": HEX, "data": [HEX...], ...}'``.
 
-Serves the stream over TCP on loopback and gives each client all data frames once, in order, after its start command.
+Serves the stream over TCP on loopback and gives each client all data frames once, in order, after its start command;
+with ``age_s`` each when it is so old by its stamp, and only those that become so while the client is there.
 Prints ``ready`` when it listens. Ends itself and its client handlers after ``limit_s`` seconds, whatever happens.
 """
 
@@ -37,9 +38,14 @@ def main() -> None:
     pmu.cfg1 = first
     pmu.set_header(job["header"])
     end_on_sigterm(pmu)
+    if job["age_s"] is not None:
+        hurry()
     pmu.run()
     sys.stdout.write("ready\n")
     sys.stdout.flush()
+    if job["age_s"] is not None:
+        due_s = [stamp_s(bytes.fromhex(frame), bytes.fromhex(job["config"])) + job["age_s"] for frame in job["data"]]
+        serve_in_time(pmu, frames, due_s)
     served: list[object] = []
     while True:
         for queue in pmu.client_buffers:
@@ -48,6 +54,31 @@ def main() -> None:
                 for frame in frames:
                     queue.put(frame)
         time.sleep(0.01)
+
+
+def stamp_s(frame: bytes, config: bytes) -> float:
+    """POSIX UTC of a data frame, by the TIME_BASE of its CFG-2."""
+    soc, fraction, time_base = (int.from_bytes(part) for part in (frame[6:10], frame[11:14], config[15:18]))
+    return soc + fraction / time_base
+
+
+def hurry() -> None:
+    """Before a frame leaves, pyc37 looks 100 ms for a command and then sleeps for a frame period: here it does not."""
+    module: Any = sys.modules["pyc37.pmu"]
+    wait = module.select
+    module.select = lambda readers, writers, errors, _: wait(readers, writers, errors, 0.002)
+    module.sleep = lambda _: None
+
+
+def serve_in_time(pmu: Any, frames: list[Any], due_s: list[float]) -> None:
+    """Give every client that is there each frame when it is due; then wait for the end."""
+    for frame, at_s in zip(frames, due_s, strict=True):
+        if at_s < time.time():
+            continue
+        time.sleep(max(0.0, at_s - time.time()))
+        for queue in list(pmu.client_buffers):
+            queue.put(frame)
+    signal.pause()
 
 
 def end_on_sigterm(pmu: Any) -> None:

@@ -82,15 +82,18 @@ def start_pyc37_pmu(
     *,
     header: str = "pyc37",
     stamp_now: bool = False,
+    age_s: float | None = None,
     limit_s: float = 30,
 ) -> Process:
     """pyc37 serving the stream of a CFG-2 frame on ``127.0.0.1:port``; returns when it listens.
 
     Every client gets the data frames once, decoded and encoded again by pyc37, after its start command and at about
-    8 frames/s; with ``stamp_now`` at the time they leave. The process ends ``limit_s`` seconds after its start.
+    8 frames/s; with ``stamp_now`` stamped with the time they leave. With ``age_s`` a frame leaves when it is so old by
+    its stamp, at any rate, and a client gets those that become so while it is there. The process ends ``limit_s``
+    seconds after its start.
     """
     job = {"port": port, "config": config.hex(), "data": [frame.hex() for frame in data], "header": header}
-    process = Process(_start("pyc37_pmu.py", job | {"stamp_now": stamp_now, "limit_s": limit_s}))
+    process = Process(_start("pyc37_pmu.py", job | {"stamp_now": stamp_now, "age_s": age_s, "limit_s": limit_s}))
     assert process.popen.stdout is not None
     readable, _, _ = select.select([process.popen.stdout], [], [], _START_S)
     if not readable or process.popen.stdout.readline() != "ready\n":
