@@ -8,9 +8,12 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.demo
 	$(BIN)/dcon demo --out demo
 
-# Most tests wait for sockets and clocks, so two run at a time. What fails beside another is judged again by itself.
+# Most tests wait for sockets and clocks, so two run at a time; then, one at a time, those that need the machine to
+# themselves. Both parts run, whatever becomes of the first.
 test: lint docs
-	$(BIN)/python -m pytest -n 2 || $(BIN)/python -m pytest --last-failed --last-failed-no-failures none
+	$(BIN)/python -m pytest -n 2 --dist loadscope -m "not alone"; beside=$$?; \
+	$(BIN)/python -m pytest -m alone; alone=$$?; \
+	exit $$((beside | alone))
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -358,6 +358,7 @@ def test_ctrl_c_ends_all_processes(number: signal.Signals, tmp_path: Path) -> No
 # --- all of it ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.alone
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_the_whole_chain_live_on_a_short_course(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

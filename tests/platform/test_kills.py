@@ -23,6 +23,7 @@ from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.timeout(1800),

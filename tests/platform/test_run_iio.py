@@ -16,6 +16,7 @@ from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run and IIO are Linux's"),

@@ -34,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 from generate.trials import TRIALS
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's"),

@@ -36,6 +36,14 @@ NAMES = ("N1", "S1")
 PATIENCE_S = 30.0
 LENGTH_S = 20
 """Of the recording that is played over and over: a whole number of swings."""
+WAY = {
+    "FAULT": ("release", "reset"),
+    "ESTOP": ("release", "reset"),
+    "STANDBY": ("reset", "ack", "closed_loop", "arm"),
+    "ARMED": ("activate",),
+    "ACTIVE": (),
+}
+"""The orders that lead from each state to the next on the way to ACTIVE."""
 PROCESSES = {
     "watchdog": "dcon.watchdog",
     "server": "dcon.cli server",
@@ -269,17 +277,19 @@ path = {self.log}
         raise AssertionError(f"{name}: {answer}; {self.status()['flags']}; {self.said()}")
 
     def activate(self) -> None:
-        """From wherever it is: ACTIVE in closed loop, with closed relays."""
-        state = self.in_state("STANDBY", "ACTIVE", "FAULT", "ESTOP")["state"]
-        if state == "ACTIVE":
-            return
-        self.obeyed("release")
-        self.obeyed("reset") if state in ("FAULT", "ESTOP") else self.order("reset")
-        self.in_state("STANDBY")
-        self.order("ack")
-        self.obeyed("closed_loop")
-        self.obeyed("arm")
-        self.obeyed("activate")
+        """From wherever it is: ACTIVE in closed loop, with closed relays.
+
+        A machine that pauses may trip it on the way: then from there.
+        """
+        end_s = time.monotonic() + PATIENCE_S
+        while (state := self.in_state(*WAY)["state"]) != "ACTIVE":
+            assert time.monotonic() < end_s, (self.status(), self.said())
+            for name in WAY[state]:
+                with suppress(SourceError):
+                    self.order(name)
+            changed_s = time.monotonic() + 1.0
+            while self.status()["state"] == state and time.monotonic() < changed_s:
+                time.sleep(0.05)
         self.until(lambda now: now["state"] == "ACTIVE" and abs(now["output_v"]) > 0.5, "a command")
 
 
@@ -305,26 +315,26 @@ datagrams = [bytes.fromhex(word) for word in sys.stdin.read().split()]
 sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 sock.bind((source, 0))
 begun, sent = time.monotonic(), 0
-while (passed := time.monotonic() - begun) < seconds:
-    while sent < passed * per_s:
+while sent < seconds * per_s:
+    while sent < min(time.monotonic() - begun, seconds) * per_s:
         sock.sendto(datagrams[sent % len(datagrams)], ("127.0.0.1", port))
         sent += 1
     time.sleep(0.001)
-print(sent)
+print(time.monotonic() - begun)
 """
 
 
 @contextmanager
 def flood(port: int, datagrams: list[bytes], seconds: float, source: str = "127.0.0.1") -> Iterator[None]:
-    """Ten thousand datagrams a second from a process of its own; checks at the end that they were as many."""
+    """Ten thousand datagrams a second from a process of its own, that many in all; a busy machine may take longer."""
     arguments = [sys.executable, "-c", FLOOD, str(port), str(seconds), source]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None and process.stdout is not None
         process.stdin.write(" ".join(data.hex() for data in datagrams))
         process.stdin.close()
         yield
-        sent = int(process.stdout.read())
-    assert sent >= 7_000 * seconds  # a machine that is busy falls behind
+        took_s = float(process.stdout.read())
+    assert took_s < 2 * seconds
 
 
 def frames_now(name: str, count: int = 100) -> list[bytes]:
