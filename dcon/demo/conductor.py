@@ -36,6 +36,8 @@ END_S = 20.0
 """For a process that was asked to end: it ramps down, and closes its log."""
 WHOLE = sys.platform == "linux"
 """All processes of the platform; elsewhere the controller is alone, and its orders are given beforehand."""
+PORTS = range(20_000, 32_000)
+"""Below those that systems give out by themselves."""
 ENDED = 130
 """Exit code of ``dcon run`` that was asked to end."""
 LAST_BYTES = 1 << 14
@@ -71,8 +73,13 @@ class Demo:
 
 
 def free_ports(count: int) -> int:
-    """The first of ``count`` consecutive UDP ports that are free now on loopback."""
-    for base in range(47100, 60000, count):
+    """The first of ``count`` consecutive UDP ports that are free now on loopback.
+
+    Where it begins to look depends on the process: of two demos that start at once, none takes what the other found.
+    """
+    room = len(PORTS) - count
+    for k in range(0, room, count):
+        base = PORTS[(os.getpid() * count + k) % room]
         held: list[socket.socket] = []
         try:
             for port in range(base, base + count):
