@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 from dcon.demo.course import Course
 from dcon.demo.judge import read_traces, summarise
 from dcon.link.keys import add_key, read_keys
+from dcon.platform.children import launch
 from dcon.server.client import Client, order
 from dcon.session.parts import free_path
 from dcon.sim.plan import ini_of
@@ -284,18 +286,12 @@ def _grid(demo: Demo, site: Site, start_ns: int) -> list[str]:
     ]
 
 
-class Child(NamedTuple):
-    """A process of the demo."""
-
-    process: subprocess.Popen[bytes]
-    said: Path
-    """What it writes to its standard error: a file, so that it never waits for somebody to read."""
-
-
-def _launch(arguments: list[str], said: Path) -> Child:
+def _launch(arguments: list[str]) -> subprocess.Popen[str]:
+    """A process that ends with this one, even where this one is killed, or interrupted before it knows of the other."""
     quiet = subprocess.DEVNULL
-    with said.open("ab") as file:
-        return Child(subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=file), said)
+    if WHOLE:
+        return launch(arguments, dies_by=signal.SIGTERM, stdout=quiet, stderr=subprocess.PIPE)
+    return subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
 
 
 def _wait(

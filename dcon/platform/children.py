@@ -20,6 +20,7 @@ def launch(
     dies_by: signal.Signals = signal.SIGKILL,
     pass_fds: Sequence[int] = (),
     stdout: int | None = None,
+    stderr: int | None = None,
     env: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[str]:
     """``python ARGUMENTS`` in a process group of its own: Ctrl-C at the terminal is for its parent to pass on.
@@ -30,6 +31,7 @@ def launch(
         [sys.executable, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=stdout,
+        stderr=stderr,
         text=True,
         env=env,
         pass_fds=pass_fds,
