@@ -8,7 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -331,13 +333,20 @@ def test_a_mistake_is_told_before_anything_starts(
     assert not (tmp_path / "x").exists()
 
 
+@pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder for what a demo that is killed leaves behind, with room in its name for that of a socket."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
 @pytest.mark.realtime
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the children in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_no_process_outlives_it(number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+def test_no_process_outlives_it(number: signal.Signals, tmp_path: Path, short: Path) -> None:
     command = [sys.executable, "-m", "dcon.cli", "demo", "--out", str(tmp_path), "--quiet"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as demo:
+    environment = os.environ | {"TMPDIR": str(short)}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment) as demo:
         try:
             deadline = time.monotonic() + 60
             while len(ended := list(descendants(demo.pid))) < 7 or not (tmp_path / "session.mcap").exists():

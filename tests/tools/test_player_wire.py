@@ -33,6 +33,7 @@ from pmutools.tools.player.ledger import LedgerWriter
 from pmutools.tools.player.play import Options, Player
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="receivers ask for Linux's arrival stamps"),
 ]
