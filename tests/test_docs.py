@@ -250,13 +250,7 @@ def run_block(page: str, fence: Fence, stack: ExitStack) -> None:
         assert said(printed, output), f"{page}: $ {shown}\n--- prints\n{output}--- is said to print\n{printed}"
 
 
-ALONE = {"docs/player.md": pytest.mark.alone}
-"""Pages whose examples show that the player keeps its times."""
-RUN = [
-    pytest.param(page, marks=ALONE.get(page, ()))
-    for page in PAGES
-    if any(fence.marker == "run" for fence in fences(page))
-]
+RUN = [page for page in PAGES if any(fence.marker == "run" for fence in fences(page))]
 RUN_SLOW = [page for page in PAGES if any(fence.marker == "run: slow" for fence in fences(page))]
 posix = pytest.mark.skipif(os.name != "posix", reason="the examples are written for a POSIX shell")
 
