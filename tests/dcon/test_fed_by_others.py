@@ -68,6 +68,14 @@ class Feed(NamedTuple):
     """Instances that these data make READY; all others must not be."""
 
     @property
+    def pairs(self) -> list[str]:
+        """Its control instances."""
+        sides: dict[str, list[str]] = {"N": [], "S": []}
+        for pmu in self.pmus:
+            sides[pmu.name[0]].append(pmu.name)
+        return [f"{north}-{south}" for north in sides["N"] for south in sides["S"]]
+
+    @property
     def nominal_hz(self) -> int:
         return 50 if self.rate == 50 else 60
 
@@ -149,12 +157,13 @@ class Session:
         assert self.process is not None
         deadline = time.monotonic() + PATIENCE_S
         while self.process.poll() is None and time.monotonic() < deadline:
-            if self.log.exists() and self.frames_of_each() > self.feed.rate and self.readied() >= self.feed.ready:
+            ticks = self.ticks() if self.log.exists() else []
+            if self.frames_of_each(ticks) > self.feed.rate and self.readied(ticks) >= self.feed.ready:
                 return
-            time.sleep(0.2)
+            time.sleep(0.5)
 
     def end(self) -> None:
-        if self.process is not None and self.process.poll() is None:
+        if self.process is not None and not (self.out or self.err):
             self.process.send_signal(signal.SIGINT)
             try:
                 self.out, self.err = self.process.communicate(timeout=30)
@@ -169,18 +178,15 @@ class Session:
         except SourceError:
             return []  # not even its beginning is there
 
-    def frames_of_each(self) -> int:
+    def frames_of_each(self, ticks: list[LoggedTick]) -> int:
         """How many frames came of the PMU of which the fewest came."""
-        names = [frame.name for tick in self.ticks() for frame in tick.frames]
+        names = [frame.name for tick in ticks for frame in tick.frames]
         return min(names.count(pmu.name) for pmu in self.feed.pmus)
 
-    def readied(self) -> set[str]:
+    def readied(self, ticks: list[LoggedTick]) -> set[str]:
         """Instances that were READY at some time."""
-        names = SessionReader(self.log).instances
-        records = [tick.record for tick in self.ticks()]
-        return {
-            name for k, name in enumerate(names) if any(r.instances[k].state is InstanceState.READY for r in records)
-        }
+        states = [[instance.state for instance in tick.record.instances] for tick in ticks]
+        return {pair for k, pair in enumerate(self.feed.pairs) if any(now[k] is InstanceState.READY for now in states)}
 
 
 def content(frame: bytes) -> bytes:
@@ -268,15 +274,17 @@ def test_it_replays_bit_for_bit_and_no_tick_is_missing(session: Session) -> None
 
 
 def test_frames_are_those_that_were_given(session: Session) -> None:
-    assert session.frames_of_each() > session.feed.rate
-    frames = [frame for tick in session.ticks() for frame in tick.frames]
+    ticks = session.ticks()
+    assert session.frames_of_each(ticks) > session.feed.rate
+    frames = [frame for tick in ticks for frame in tick.frames]
     for pmu in session.feed.pmus:
         own = [frame for frame in frames if frame.name == pmu.name]
         assert {content(frame.wire) for frame in own} <= session.given[pmu.source]
 
 
 def test_instances_become_ready_where_the_data_allow_it(session: Session) -> None:
-    assert session.readied() == session.feed.ready
+    assert list(SessionReader(session.log).instances) == session.feed.pairs
+    assert session.readied(session.ticks()) == session.feed.ready
 
 
 def test_devices_without_a_clock_are_heard_and_not_used(sessions: dict[str, Session]) -> None:
