@@ -286,12 +286,23 @@ def _grid(demo: Demo, site: Site, start_ns: int) -> list[str]:
     ]
 
 
-def _launch(arguments: list[str]) -> subprocess.Popen[str]:
+class Child(NamedTuple):
+    """A process of the demo."""
+
+    process: subprocess.Popen[str]
+    said: Path
+    """What it writes to its standard error: a file, so that it never waits for somebody to read."""
+
+
+def _launch(arguments: list[str], said: Path) -> Child:
     """A process that ends with this one, even where this one is killed, or interrupted before it knows of the other."""
     quiet = subprocess.DEVNULL
-    if WHOLE:
-        return launch(arguments, dies_by=signal.SIGTERM, stdout=quiet, stderr=subprocess.PIPE)
-    return subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
+    with said.open("ab") as file:
+        if WHOLE:
+            process = launch(arguments, dies_by=signal.SIGTERM, stdout=quiet, stderr=file.fileno())
+        else:
+            process = subprocess.Popen([sys.executable, *arguments], stdin=quiet, stdout=quiet, stderr=file, text=True)
+    return Child(process, said)
 
 
 def _wait(
@@ -352,7 +363,7 @@ def _last_words(child: Child) -> str:
     return lines[-1] if lines else f"exit code {child.process.returncode}"
 
 
-def _reap(process: subprocess.Popen[bytes]) -> None:
+def _reap(process: subprocess.Popen[str]) -> None:
     try:
         process.wait(END_S)
     except subprocess.TimeoutExpired:
