@@ -15,7 +15,9 @@ from contextlib import suppress
 
 from dcon.core.values import Pdci
 from dcon.demo.course import Course
-from dcon.drivers import line_status, udp_command
+from dcon.drivers import line_status
+from dcon.link import command as datagrams
+from dcon.link.sealed import follows
 from pmutools import timebase
 from pmutools.c37118.session import served
 from pmutools.clock import SystemClock, utc_offset
@@ -123,9 +125,9 @@ class LiveGrid:
 
     def _take_commands(self) -> None:
         for chunk in self.inbox.read():
-            command = udp_command.decode(chunk.data)
+            command = datagrams.decode(chunk.data)
             last = self.last_sequence
-            if command is None or (last is not None and not udp_command.follows(command.sequence, last)):
+            if command is None or (last is not None and not follows(command.sequence, last)):
                 continue
             self.last_sequence = command.sequence
             self.last_command_ns = chunk.arrival_ns or command.time_ns

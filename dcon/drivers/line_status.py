@@ -10,24 +10,20 @@ that they cross must be trusted.
 from __future__ import annotations
 
 import math
-import struct
 import threading
 import time
-import zlib
 from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
 from dcon.core.values import Pdci
 from dcon.drivers.modbus import Bus, BusError, told
-from dcon.drivers.udp_command import follows
+from dcon.link.sealed import WRAP, Sealed, follows
 from dcon.places import ModbusLine
 from pmutools.timebase import NS
 
-MAGIC = b"DCP1"
-_BODY = struct.Struct(">4sIqdddI")
-_CRC = struct.Struct(">I")
-SIZE = _BODY.size + _CRC.size
+_DCP1 = Sealed(b"DCP1", "IqdddI")
+SIZE = _DCP1.size
 IN_SERVICE, DCON_ENABLED = 1, 2
 """Flags of the datagram, and bits of the status word of a device."""
 SILENCE_NS = 2 * NS
@@ -46,17 +42,15 @@ class Status(NamedTuple):
 def encode(sequence: int, line: Pdci) -> bytes:
     """The datagram of a status; the sequence wraps at 2**32."""
     flags = line.in_service * IN_SERVICE | line.dcon_enabled * DCON_ENABLED
-    body = _BODY.pack(MAGIC, sequence & 0xFFFFFFFF, line.time_ns, line.power_mw, line.scheduled_mw, 0.0, flags)
-    return body + _CRC.pack(zlib.crc32(body))
+    return _DCP1.pack(sequence % WRAP, line.time_ns, line.power_mw, line.scheduled_mw, 0.0, flags)
 
 
 def decode(datagram: bytes) -> Status | None:
     """The status in a datagram; None for anything else."""
-    if len(datagram) != SIZE or datagram[:4] != MAGIC:
+    values = _DCP1.unpack(datagram)
+    if values is None:
         return None
-    if zlib.crc32(datagram[:-4]) != _CRC.unpack(datagram[-4:])[0]:
-        return None
-    _, sequence, time_ns, power_mw, scheduled_mw, _, flags = _BODY.unpack(datagram[:-4])
+    sequence, time_ns, power_mw, scheduled_mw, _, flags = values
     return Status(sequence, _line(time_ns, power_mw, scheduled_mw, flags))
 
 

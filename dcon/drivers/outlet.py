@@ -16,10 +16,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from dcon.drivers.driver import bounded_v
-from dcon.drivers.udp_command import decode, follows
-
-CLOSED = 1 << 1
-"""Flag of DCN1: the relays are closed."""
+from dcon.link.command import CLOSED, decode
+from dcon.link.sealed import follows
 
 
 class Drive(NamedTuple):

@@ -1,68 +1,17 @@
-"""The command as a UDP datagram, to a plant model or a gateway. 40 bytes, big-endian::
-
-    4s magic "DCN1" | I sequence | q time_ns (UTC of the tick) | d command MW | d output V | I flags | I CRC-32
-
-The MW are those really driven: 0 in open loop. A receiver must ignore what is not 40 bytes, has another magic, a
-CRC that does not hold, or a sequence it has passed; and must go to 0 MW when datagrams stop coming.
-"""
+"""Commands straight to a plant model or a gateway, as :mod:`dcon.link.command` lays them out."""
 
 from __future__ import annotations
 
 import socket
-import struct
-import zlib
 from contextlib import suppress
-from typing import NamedTuple
 
 from dcon.drivers.driver import Readback
 from dcon.limiter import MW_PER_V
+from dcon.link.command import CommandOut, encode
 from dcon.places import Destination
 from pmutools.errors import SettingsError
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.sockets import explain, resolve
-
-MAGIC = b"DCN1"
-_BODY = struct.Struct(">4sIqddI")
-_CRC = struct.Struct(">I")
-SIZE = _BODY.size + _CRC.size
-
-
-class CommandOut(NamedTuple):
-    """What one datagram says."""
-
-    sequence: int
-    time_ns: int
-    command_mw: float
-    output_v: float
-    flags: int = 0
-
-
-def encode(command: CommandOut) -> bytes:
-    """The datagram of a command; the sequence wraps at 2**32."""
-    body = _BODY.pack(
-        MAGIC,
-        command.sequence & 0xFFFFFFFF,
-        command.time_ns,
-        command.command_mw,
-        command.output_v,
-        command.flags & 0xFFFFFFFF,
-    )
-    return body + _CRC.pack(zlib.crc32(body))
-
-
-def decode(datagram: bytes) -> CommandOut | None:
-    """The command in a datagram; None for anything else."""
-    if len(datagram) != SIZE or datagram[:4] != MAGIC:
-        return None
-    if zlib.crc32(datagram[:-4]) != _CRC.unpack(datagram[-4:])[0]:
-        return None
-    _, sequence, time_ns, command_mw, output_v, flags = _BODY.unpack(datagram[:-4])
-    return CommandOut(sequence, time_ns, command_mw, output_v, flags)
-
-
-def follows(sequence: int, last: int) -> bool:
-    """Whether a sequence, which wraps at 2**32, is newer than ``last``."""
-    return 0 < (sequence - last) % (1 << 32) < 1 << 31
 
 
 class UdpCommandDriver:

@@ -13,10 +13,10 @@ The watchdog has a codec of its own for the same datagrams, and the tests hold t
 
 from __future__ import annotations
 
-import struct
-import zlib
 from enum import IntEnum, StrEnum
 from typing import Final, NamedTuple
+
+from dcon.link.sealed import WRAP, Sealed
 
 
 class LoopName(StrEnum):
@@ -64,6 +64,10 @@ CAUSES: Final = (
     *("relay_open", "relay_welded", "drive", "late", "latch_unreadable"),
 )
 """Names of the bits of ``causes``, lowest first."""
+_DCB1 = Sealed(b"DCB1", "8sIqB3x")
+_DCR1 = Sealed(b"DCR1", "Iqd")
+_DCO1 = Sealed(b"DCO1", "B3x32s")
+_DCW1 = Sealed(b"DCW1", "IqBBBBI8H")
 WHO_BYTES: Final = 32
 UNHEARD: Final = 0xFFFF
 """Age in a status of a beat that never came."""
@@ -108,46 +112,31 @@ class WatchdogStatus(NamedTuple):
         return self.estop_software and self.estop_a and self.estop_b
 
 
-def _with_crc(layout: str, *values: object) -> bytes:
-    body = struct.pack(">" + layout, *values)
-    return body + zlib.crc32(body).to_bytes(4, "big")
-
-
-def _without_crc(datagram: bytes, magic: bytes, layout: str) -> tuple[int, ...] | None:
-    """What follows the magic, as ``layout`` lays it out; None for another datagram or one that is damaged."""
-    body, crc = datagram[:-4], datagram[-4:]
-    if not datagram.startswith(magic) or len(body) != 4 + struct.calcsize(">" + layout):
-        return None
-    if zlib.crc32(body).to_bytes(4, "big") != crc:
-        return None
-    return struct.unpack_from(">" + layout, body, 4)
-
-
 def encode_beat(loop: LoopName, counter: int, monotonic_ns: int, state: LoopState = LoopState.RUNNING) -> bytes:
     """A sign of life; ``counter`` advances with each round of the loop, and wraps at 2**32."""
-    return _with_crc("4s8sIqB3x", b"DCB1", loop.encode(), counter & 0xFFFFFFFF, monotonic_ns, state)
+    return _DCB1.pack(loop.encode(), counter % WRAP, monotonic_ns, state)
 
 
 def encode_readback(readback: Readback) -> bytes:
     """To the watchdog, and to the controller."""
-    return _with_crc("4sIqd", b"DCR1", readback.sequence & 0xFFFFFFFF, readback.monotonic_ns, readback.volts)
+    return _DCR1.pack(readback.sequence % WRAP, readback.monotonic_ns, readback.volts)
 
 
 def decode_readback(datagram: bytes) -> Readback | None:
     """None for anything else."""
-    values = _without_crc(datagram, b"DCR1", "Iqd")
+    values = _DCR1.unpack(datagram)
     return None if values is None else Readback(*values)
 
 
 def encode_word(verb: Verb, who: str) -> bytes:
     """An operator's word; of a longer name as many whole characters as find room in 32 bytes."""
     name = who.encode()[:WHO_BYTES].decode(errors="ignore").encode()
-    return _with_crc("4sB3x32s", b"DCO1", verb, name)
+    return _DCO1.pack(verb, name)
 
 
 def decode_status(datagram: bytes) -> WatchdogStatus | None:
     """None for anything else, and for a state that there is not."""
-    values = _without_crc(datagram, b"DCW1", "IqBBBBI8H")
+    values = _DCW1.unpack(datagram)
     if values is None or values[4] not in tuple(WatchdogState):
         return None
     counter, monotonic_ns, relays, estop, state, healthy, causes, *ages = values

@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from dcon.core.values import Order
-from dcon.drivers.udp_command import CommandOut, encode
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.beats import LoopName
 from dcon.link.bundle import Entry
+from dcon.link.command import CommandOut, encode
 from dcon.link.crossing import Counts, Failure, Item, decode
 from dcon.link.paths import Sender
 from dcon.link.shipper import Ring, Shipper

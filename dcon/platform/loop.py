@@ -22,6 +22,7 @@ from dcon.core.rows import CORE
 from dcon.core.system import ENGAGED, Trigger
 from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
+from dcon.link.command import RELAYS
 from dcon.link.crossing import Failure, Item, PmuFrameIn
 from dcon.platform.orders import OrderBook, TimedOrder
 from dcon.platform.ports import Ends, Log, Told
@@ -58,8 +59,6 @@ TROUBLE = frozenset(
         LinkKind.OWN_DROPS,
     )
 )
-RELAYS = 1
-"""Flag of a command: the controller asks for closed relays."""
 _DISARM = (Order(str(Trigger.DISARM)),)
 
 

@@ -18,7 +18,8 @@ from dcon.core.rows import CORE
 from dcon.core.system import DRIVING, MODE_IS_FREE, ORDERS, PERMISSIVES, TRANSITIONS, Trigger
 from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
-from dcon.drivers import line_status, udp_command
+from dcon.drivers import line_status
+from dcon.link import command
 from dcon.places import IioKeys, OutputRegisters, StatusRegisters
 from dcon.sections import LineInput, Log, Output, Platform, Server
 from dcon.settings import ELSEWHERE
@@ -229,7 +230,7 @@ GENERATORS = {
     "settings-output": lambda: keys(Output),
     "settings-platform": lambda: keys(Platform),
     "settings-log": lambda: keys(Log),
-    "command-datagram": lambda: datagram(udp_command),
+    "command-datagram": lambda: datagram(command),
     "status-datagram": lambda: datagram(line_status),
     "iio-keys": lambda: keys(IioKeys),
     "modbus-output-keys": lambda: keys(OutputRegisters),

@@ -27,7 +27,7 @@ from dcon.demo.course import BRAKE_S, Course
 from dcon.demo.grid import SILENCE_NS, LiveGrid
 from dcon.demo.judge import PAPER, judge, read_traces, summarise
 from dcon.drivers import line_status
-from dcon.drivers.udp_command import CommandOut, encode
+from dcon.link.command import CommandOut, encode
 from dcon.sim.plan import START_NS, Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run

@@ -25,8 +25,8 @@ from support.swing import Streams, peak_after
 
 from dcon.cli import dcon
 from dcon.core.values import InstanceState, Mode, SystemState
-from dcon.drivers.udp_command import CommandOut
 from dcon.limiter import SLEW_MW_PER_S
+from dcon.link.command import CommandOut
 from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.replay import replay
 from pmutools.cli.shell import run

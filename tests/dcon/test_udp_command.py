@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dcon.drivers.driver import Driver
-from dcon.drivers.udp_command import MAGIC, SIZE, CommandOut, UdpCommandDriver, decode, encode
+from dcon.drivers.udp_command import UdpCommandDriver
 from dcon.limiter import MW_PER_V
+from dcon.link.command import SIZE, CommandOut, decode, encode
 from dcon.places import IioPlace
 from pmutools.errors import SettingsError
 from pmutools.net.endpoint import parse_endpoint
@@ -51,7 +52,7 @@ def test_no_flipped_bit_is_a_command(command: CommandOut, bit: int) -> None:
 @given(st.binary(max_size=64))
 def test_no_other_bytes_are_a_command(data: bytes) -> None:
     assert decode(data) is None
-    assert decode(MAGIC + data) is None
+    assert decode(b"DCN1" + data) is None
 
 
 def test_sequence_and_flags_wrap() -> None:

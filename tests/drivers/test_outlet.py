@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dcon.drivers.outlet import CLOSED, Drive, Outlet
-from dcon.drivers.udp_command import CommandOut, encode, follows
+from dcon.link.command import CommandOut, encode
+from dcon.link.sealed import follows
 
 HOLD_NS = 100_000_000
 MS = 1_000_000

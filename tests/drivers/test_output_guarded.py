@@ -17,7 +17,6 @@ from support.iio import SCALE_MV, iio_device
 from support.modbus_device import Device, modbus_device, wait_for
 from support.run_folder import Listener, is_socket, listening
 
-from dcon.drivers.udp_command import CommandOut, encode
 from dcon.link.beats import (
     LoopName,
     LoopState,
@@ -28,9 +27,14 @@ from dcon.link.beats import (
     encode_beat,
     encode_word,
 )
+from dcon.link.command import CommandOut, encode
 from dcon.link.paths import CONTROL, OUTPUT, WATCHDOG, Sender, prepare
 
-pytestmark = [pytest.mark.realtime, pytest.mark.skipif(sys.platform != "linux", reason="run folders are Linux's")]
+pytestmark = [
+    pytest.mark.alone,
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="run folders are Linux's"),
+]
 PMUS = "[pmu A]\nurl = udp://127.0.0.1:1\nside = north\n[pmu B]\nurl = udp://127.0.0.1:2\nside = south\n"
 VOLTS = 2.5
 LONGEST_MS = 2000

@@ -20,8 +20,8 @@ from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.cli import dcon
 from dcon.drivers.outlet import CLOSED
-from dcon.drivers.udp_command import CommandOut, encode
 from dcon.link.beats import LoopState
+from dcon.link.command import CommandOut, encode
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, OUTPUT, WATCHDOG, prepare
 from dcon.places import destination

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from support.running import PROCESSES, Running
 
-from dcon.drivers.udp_command import CommandOut
+from dcon.link.command import CommandOut
 from dcon.session.reader import SessionReader
 from dcon.session.replay import replay
 

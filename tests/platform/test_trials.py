@@ -23,7 +23,7 @@ from support.swing import Streams
 
 from dcon.cli import dcon
 from dcon.core.values import Event, Order
-from dcon.drivers.udp_command import CommandOut
+from dcon.link.command import CommandOut
 from dcon.link.orders import SignedOrder, sign
 from dcon.server.client import Client
 from dcon.session.reader import LoggedTick, SessionReader

@@ -13,8 +13,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from dcon.drivers.udp_command import CommandOut, decode
 from dcon.link.beats import WatchdogStatus, decode_status
+from dcon.link.command import CommandOut, decode
 
 DEADLINE_S = 20.0
 

@@ -9,7 +9,7 @@ from types import TracebackType
 
 from support.swing import MS, Streams
 
-from dcon.drivers.udp_command import CommandOut, decode
+from dcon.link.command import CommandOut, decode
 from pmutools.c37118.session import served
 from pmutools.clock import SystemClock, utc_offset
 from pmutools.net.endpoint import parse_endpoint

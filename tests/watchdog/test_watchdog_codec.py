@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.drivers import udp_command
 from dcon.link import beats
+from dcon.link import command as link_command
 from dcon.watchdog import codec, memory, rules
 
 U32 = st.integers(0, 2**32 - 1)
@@ -57,11 +57,11 @@ def test_a_word(verb: beats.Verb, who: str) -> None:
 
 @given(U32, st.integers(0, 2**62), FINITE, FINITE, st.booleans(), st.integers(-(10**9), 10**9))
 def test_a_command(sequence: int, time_ns: int, mw: float, volts: float, relays: bool, age_ms: int) -> None:
-    sent = udp_command.encode(udp_command.CommandOut(sequence, time_ns, mw, volts, int(relays)))
+    sent = link_command.encode(link_command.CommandOut(sequence, time_ns, mw, volts, int(relays)))
     said = codec.decode(sent, time_ns + age_ms * 10**6)
     assert said == codec.Command(sequence, time_ns, mw, volts, relays, age_ms)
     passed = codec.encode_command(sequence, time_ns, mw, volts, codec.RELAYS | codec.CLOSED)
-    assert udp_command.decode(passed) == udp_command.CommandOut(sequence, time_ns, mw, volts, 3)
+    assert link_command.decode(passed) == link_command.CommandOut(sequence, time_ns, mw, volts, 3)
 
 
 AGES = st.lists(st.integers(0, 65_535), min_size=8, max_size=8)
@@ -97,7 +97,7 @@ def test_a_status(
 def test_counters_wrap() -> None:
     status = beats.decode_status(codec.encode_status(2**32 + 5, 0, 0, 0, 0, False, 0))
     assert status is not None and status.counter == 5
-    command = udp_command.decode(codec.encode_command(2**32 + 7, 0, 0.0, 0.0, 0))
+    command = link_command.decode(codec.encode_command(2**32 + 7, 0, 0.0, 0.0, 0))
     assert command is not None and command.sequence == 7
     beat = codec.decode(beats.encode_beat(beats.LoopName.GPS, 2**32 + 9, 0), 0)
     assert isinstance(beat, codec.Beat) and beat.counter == 9

@@ -16,8 +16,8 @@ import pytest
 from support.dogs import closed, until, watchdog
 from support.guarded import TICK_NS, Bench
 
-from dcon.drivers.udp_command import CommandOut, encode
 from dcon.link.beats import Verb, WatchdogState, encode_word
+from dcon.link.command import CommandOut, encode
 from dcon.watchdog import latch
 from dcon.watchdog.codec import Word
 from dcon.watchdog.latch import NAME, UNREADABLE, Latch, causes_in, found, keep, text_of

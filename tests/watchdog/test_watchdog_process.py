@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from support.dogs import Dog, beating, closed, until, watchdog
 
-from dcon.drivers.udp_command import CommandOut, decode, encode
 from dcon.link.beats import LoopName, LoopState, Verb, WatchdogState, encode_beat, encode_word
+from dcon.link.command import CommandOut, decode, encode
 from dcon.watchdog import loop
 from dcon.watchdog.core import step
 from dcon.watchdog.files import Lines
