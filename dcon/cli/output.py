@@ -22,7 +22,7 @@ def command(ini: str, run_dir: str, as_json: bool, quiet: bool, verbose: int) ->
     """
     from dcon.link.notify import Notifier
     from dcon.link.paths import prepare
-    from dcon.platform.output import OutputProcess
+    from dcon.output.process import OutputProcess
     from dcon.settings import load
     from pmutools.log_thread import log_in_thread
     from pmutools.realtime import go_realtime

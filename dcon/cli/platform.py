@@ -18,9 +18,9 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.parsers import number
 
 if TYPE_CHECKING:
+    from dcon.control.loop import Platform, Summary
     from dcon.engine import Tick
     from dcon.link.notify import Notifier
-    from dcon.platform.loop import Platform, Summary
     from dcon.settings import Settings
 
 
@@ -53,8 +53,8 @@ def command(
 
     Research software: it has never moved a real HVDC line.
     """
+    from dcon.control.orders import parse_order
     from dcon.link.notify import STOPPING, Notifier
-    from dcon.platform.orders import parse_order
     from dcon.settings import load
     from pmutools.log_thread import log_in_thread
     from pmutools.timebase import parse_utc
@@ -100,18 +100,18 @@ def _session(
     settings: Settings, ini: Path, folder: Path | None, log_path: str, notifier: Notifier
 ) -> Iterator[Platform]:
     """A platform that signals end: alone, or with its children in a run folder."""
-    from dcon.platform.loop import SPIN_NS, Platform
+    from dcon.control.loop import SPIN_NS, Platform
     from pmutools.clock import SystemClock
 
     clock = SystemClock(spin_ns=SPIN_NS)
     with _Signals() as signals:
         if folder is None:
-            from dcon.platform.alone import own_ends
+            from dcon.control.alone import own_ends
 
             ends = own_ends(settings, clock, log_path)
         else:
+            from dcon.control.linked import Linked
             from dcon.link.paths import prepare
-            from dcon.platform.linked import Linked
 
             ends = Linked(settings, ini, prepare(folder), clock).ends
         platform = Platform(settings, ends, clock, ticked=_Herald(notifier))

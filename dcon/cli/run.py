@@ -45,8 +45,8 @@ def command(
     """
     if sys.platform != "linux":
         raise SettingsError("dcon run needs Linux; dcon platform alone runs elsewhere too")
+    from dcon.household.household import Household
     from dcon.link.notify import Notifier
-    from dcon.platform.household import Household
     from dcon.settings import load
     from pmutools.timebase import NS, format_utc, parse_utc
 

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 from dcon.demo.course import Course
 from dcon.demo.judge import read_traces, summarise
+from dcon.link.children import launch
 from dcon.link.keys import add_key, read_keys
-from dcon.platform.children import launch
 from dcon.server.client import Client, order
 from dcon.session.parts import free_path
 from dcon.sim.plan import ini_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dcon.control.orders import TimedOrder
 from dcon.core.values import Order
-from dcon.platform.orders import TimedOrder
 from pmutools.grid.scenarios import BRAKE_MW, Pulse, Scenario
 
 BRAKE_S = 0.5

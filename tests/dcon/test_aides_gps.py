@@ -14,10 +14,10 @@ from support.live import free_ports
 from support.modbus_device import wait_for
 from support.run_folder import Listener, in_thread, listening
 
+from dcon.aides.gps import GpsAide
+from dcon.aides.gps_lock import FRESH_NS, Lock, Verdict, judge
 from dcon.link.beats import LoopState
 from dcon.link.paths import CONTROL, WATCHDOG, prepare
-from dcon.platform.aides import GpsAide
-from dcon.platform.gps_lock import FRESH_NS, Lock, Verdict, judge
 from dcon.sections import Platform
 from pmutools.clocksources.asking import NoAnswer
 from pmutools.clocksources.chrony import Chronyd

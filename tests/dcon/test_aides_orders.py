@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from support.modbus_device import wait_for
 from support.run_folder import in_thread, is_socket, listening, send
 
+from dcon.aides.order_gate import OrderGate, Passed
+from dcon.aides.orders import GuiAide
 from dcon.link.keys import SEQUENCES, add_key, read_keys
 from dcon.link.orders import SignedOrder, Verifier, digest, sign
 from dcon.link.paths import AIDE, CONTROL, REPLIES, WATCHDOG, Sender, bind_datagram, prepare, release
-from dcon.platform.aides import GuiAide
-from dcon.platform.order_gate import OrderGate, Passed
 from dcon.server.desk import Desk
 from pmutools.errors import SourceError
 from pmutools.timebase import NS
@@ -260,7 +260,7 @@ def write_ini(folder: Path, extra: str = "") -> Path:
 
 @contextmanager
 def process(ini: Path, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    arguments = ["-m", "dcon.platform.aides", "--ini", str(ini), "--run-dir", str(folder)]
+    arguments = ["-m", "dcon.aides", "--ini", str(ini), "--run-dir", str(folder)]
     started = subprocess.Popen([sys.executable, *arguments], stderr=subprocess.PIPE, text=True)
     try:
         yield started
@@ -305,7 +305,7 @@ def test_it_ends_with_its_parent(folder: Path) -> None:
     ini = write_ini(folder)
     launch = (
         "import subprocess, sys, time\n"
-        "child = subprocess.Popen([sys.executable, '-m', 'dcon.platform.aides', *sys.argv[1:]])\n"
+        "child = subprocess.Popen([sys.executable, '-m', 'dcon.aides', *sys.argv[1:]])\n"
         "print(child.pid, flush=True)\ntime.sleep(60)\n"
     )
     arguments = ["--ini", str(ini), "--run-dir", str(folder)]
@@ -325,7 +325,7 @@ def _alive(pid: int) -> bool:
 
 
 def test_a_taken_port_of_the_line_frees_what_was_taken_before(folder: Path) -> None:
-    from dcon.platform.aides import aides as make
+    from dcon.aides.crew import aides as make
     from dcon.settings import load
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:

@@ -13,12 +13,12 @@ from support.live import free_udp_port
 from support.modbus_device import modbus_device, wait_for
 from support.run_folder import in_thread, listening
 
+from dcon.aides.line import PdciAide
 from dcon.core.values import Pdci
 from dcon.drivers.line_status import encode
 from dcon.drivers.modbus import to_registers
 from dcon.link.paths import CONTROL, WATCHDOG, prepare
 from dcon.places import line_source
-from dcon.platform.aides import PdciAide
 from pmutools.errors import SourceError
 
 pytestmark = pytest.mark.realtime

@@ -105,7 +105,7 @@ def test_exit_codes_and_no_traceback(
     arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dcon.platform.loop.prepare", lambda *, fifo: None)
+    monkeypatch.setattr("dcon.control.loop.prepare", lambda *, fifo: None)
     urls = ["udp://127.0.0.1:0?source=127.0.0.1", "udp://127.0.0.1:0"]
     Path("dcon.ini").write_text(Streams(("N1", "S1")).ini(urls=urls))
     assert run(dcon(), arguments) == code
@@ -124,7 +124,7 @@ def test_an_error_that_nobody_expected_is_one_line_too(
     assert err == "dcon: internal error: ZeroDivisionError: integer division or modulo by zero (--debug shows where)\n"
 
 
-@pytest.mark.parametrize("module", ["dcon.cli", "dcon.cli.platform", "dcon.platform.loop"])
+@pytest.mark.parametrize("module", ["dcon.cli", "dcon.cli.platform", "dcon.control.loop"])
 def test_nothing_heavy_is_imported_before_sockets_are_open(module: str) -> None:
     heavy = ["numpy", "scipy", "pyarrow", "matplotlib", "mcap", "scapy", "rich"]
     code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"

@@ -12,11 +12,11 @@ import pytest
 from support.swing import MS, START_NS, Streams
 from support.virtual_platform import FLOWS, ORDERS, STREAMS, Bench, Item, config_chunk, stream, virtual_platform
 
+from dcon.control.loop import EARLY_NS, TOLD
+from dcon.control.orders import parse_order
+from dcon.control.waiting import CONFIGS
 from dcon.core.values import SystemState
 from dcon.limiter import SLEW_MW_PER_S
-from dcon.platform.loop import EARLY_NS, TOLD
-from dcon.platform.orders import parse_order
-from dcon.platform.waiting import CONFIGS
 from dcon.session.reader import SessionReader
 from dcon.session.replay import identical
 from pmutools.c37118 import StreamConfig

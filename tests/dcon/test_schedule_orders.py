@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dcon.cli.ctl import LOOKS, VERBS
+from dcon.control.orders import OrderBook, TimedOrder, parse_order
+from dcon.control.schedule import TickGrid
 from dcon.core.system import ORDERS
 from dcon.core.values import Order
-from dcon.platform.orders import OrderBook, TimedOrder, parse_order
-from dcon.platform.schedule import TickGrid
 from pmutools.errors import SettingsError
 
 NS = 1_000_000_000

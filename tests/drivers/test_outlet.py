@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.drivers.outlet import CLOSED, Drive, Outlet
 from dcon.link.command import CommandOut, encode
 from dcon.link.sealed import follows
+from dcon.output.outlet import CLOSED, Drive, Outlet
 
 HOLD_NS = 100_000_000
 MS = 1_000_000

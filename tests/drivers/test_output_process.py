@@ -19,13 +19,13 @@ from support.modbus_device import modbus_device, wait_for
 from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.cli import dcon
-from dcon.drivers.outlet import CLOSED
 from dcon.link.beats import LoopState
 from dcon.link.command import CommandOut, encode
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, OUTPUT, WATCHDOG, prepare
+from dcon.output.outlet import CLOSED
+from dcon.output.process import OutputProcess
 from dcon.places import destination
-from dcon.platform.output import OutputProcess
 from dcon.sections import Output
 from pmutools.cli.shell import run
 from pmutools.errors import SettingsError, SourceError

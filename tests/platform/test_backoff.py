@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from dcon.platform.backoff import FIRST_S, LONGEST_S, STAYED_S, Backoff
+from dcon.household.backoff import FIRST_S, LONGEST_S, STAYED_S, Backoff
 
 
 def waits(*ran_s: float) -> list[float]:

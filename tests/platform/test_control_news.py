@@ -10,9 +10,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from dcon.control.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, surroundings, watchdog_of
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import Readback, WatchdogState, encode_readback
-from dcon.platform.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, surroundings, watchdog_of
 from dcon.session.codec import Watchdog, encode_order, encode_pdci, encode_surroundings
 from dcon.watchdog.codec import encode_status
 

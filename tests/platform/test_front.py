@@ -17,14 +17,14 @@ import pytest
 from support.live import free_udp_port
 from support.swing import Streams
 
+from dcon.control.linked import PairFrames, pair
+from dcon.front.front import KEPT, ROUND_NS, Front, Outlet
+from dcon.front.receiving import Reception
 from dcon.link.beats import LoopName
+from dcon.link.children import launch
 from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, decode
 from dcon.link.paths import Sender
-from dcon.platform.children import launch
-from dcon.platform.front import KEPT, ROUND_NS, Front, Outlet
-from dcon.platform.linked import PairFrames, pair
-from dcon.platform.pulse import Pulse
-from dcon.platform.receiving import Reception
+from dcon.link.pulse import Pulse
 from dcon.settings import parse
 from pmutools.c37118 import Frame
 from pmutools.c37118.config import encode_config
@@ -258,7 +258,7 @@ def start(folder: Path, ports: list[int]) -> tuple[subprocess.Popen[str], PairFr
     (folder / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra="\n[platform]\nfifo = no\n"))
     ours, theirs = pair()
     with theirs:
-        command = ["-m", "dcon.platform.front", "--ini", str(folder / "site.ini"), "--run-dir", str(folder)]
+        command = ["-m", "dcon.front", "--ini", str(folder / "site.ini"), "--run-dir", str(folder)]
         process = launch([*command, "--fd", str(theirs.fileno())], pass_fds=(theirs.fileno(),))
     return process, PairFrames(ours, CLOCK)
 
@@ -278,7 +278,7 @@ def test_a_front_dies_with_its_parent_even_while_it_is_stopped(tmp_path: Path) -
     """The parent here is a process that is killed; what it leaves must be gone."""
     script = (
         "import sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
-        "from dcon.platform.children import launch;"
+        "from dcon.link.children import launch;"
         "p = launch(['-c', 'import time; time.sleep(60)']); print(p.pid, flush=True); time.sleep(60)"
     )
     root = str(Path(__file__).parents[2])

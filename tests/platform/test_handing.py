@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
+from dcon.aides.handing import NOT_TAKEN, PATIENCE_NS, STOPPED, WAITING, Handing, Reply
+from dcon.aides.order_gate import Passed
 from dcon.link.orders import ANSWER_NS
-from dcon.platform.handing import NOT_TAKEN, PATIENCE_NS, STOPPED, WAITING, Handing, Reply
-from dcon.platform.order_gate import Passed
 
 PATH = "/run/dcon/server.replies"
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
+from dcon.household import household
+from dcon.household.household import ENDED, STARTED, Household
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, bind_datagram, prepare
-from dcon.platform import household
-from dcon.platform.household import ENDED, STARTED, Household
 from pmutools.errors import SourceError
 
 pytestmark = [

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from support.virtual_platform import FLOWS, STREAMS, Clock, Script
 
+from dcon.front.receiving import Reception
 from dcon.link.crossing import Item, PmuFrameIn
-from dcon.platform.receiving import Reception
 from pmutools.c37118 import FrameType, StreamConfig
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import PhasorChannel, encode_config

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.platform.waiting import CONFIGS, CONFIGS_NS, FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
+from dcon.control.waiting import CONFIGS, CONFIGS_NS, FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
 from pmutools.c37118 import Frame
 from pmutools.flow import StampSource
 

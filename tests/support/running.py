@@ -48,8 +48,8 @@ PROCESSES = {
     "watchdog": "dcon.watchdog",
     "server": "dcon.cli server",
     "platform": "dcon.cli platform",
-    "front": "dcon.platform.front",
-    "aides": "dcon.platform.aides",
+    "front": "dcon.front",
+    "aides": "dcon.aides",
 }
 """What is on the command line of each."""
 

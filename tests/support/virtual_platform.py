@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from support.swing import MS, START_NS, Streams
 
+from dcon.control import loop
+from dcon.control.alone import OwnFrames
+from dcon.control.loop import Platform, Summary
+from dcon.control.orders import TimedOrder, parse_order
+from dcon.control.ports import Ends
 from dcon.core.values import Record
-from dcon.platform import loop
-from dcon.platform.alone import OwnFrames
-from dcon.platform.loop import Platform, Summary
-from dcon.platform.orders import TimedOrder, parse_order
-from dcon.platform.ports import Ends
-from dcon.platform.receiving import Reception
+from dcon.front.receiving import Reception
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
 from dcon.session.replay import replay

@@ -20,10 +20,10 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from dcon.household.backoff import Backoff
 from dcon.link import paths
+from dcon.link.children import ending, launch
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
-from dcon.platform.backoff import Backoff
-from dcon.platform.children import ending, launch
 from pmutools.errors import SourceError
 
 LOG = logging.getLogger(__name__)

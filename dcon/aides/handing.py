@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+from dcon.aides.order_gate import Passed
 from dcon.core.system import Trigger
-from dcon.platform.order_gate import Passed
 from pmutools.timebase import NS
 
 PATIENCE_NS: Final = NS

@@ -1,6 +1,6 @@
 """The output process: commands from the watchdog to a DAC or a Modbus device, and what they read back.
 
-What is driven is decided by :class:`~dcon.drivers.outlet.Outlet`. Readbacks go to the watchdog and to the control
+What is driven is decided by :class:`~dcon.output.outlet.Outlet`. Readbacks go to the watchdog and to the control
 process; the loop ``output`` beats. Killed with SIGKILL, it leaves the output at its last value: the relays are what
 opens then.
 """
@@ -16,13 +16,13 @@ from pathlib import Path
 from dcon.drivers.driver import Driver
 from dcon.drivers.iio import IioDriver
 from dcon.drivers.modbus_output import ModbusDriver
-from dcon.drivers.outlet import Drive, Outlet
 from dcon.link import paths
 from dcon.link.beats import LoopName, LoopState, Readback, encode_readback
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.paths import Sender
+from dcon.link.pulse import Pulse
+from dcon.output.outlet import Drive, Outlet
 from dcon.places import IioPlace, ModbusPlace
-from dcon.platform.pulse import Pulse
 from dcon.sections import Output
 from pmutools.clock import Clock, SystemClock
 from pmutools.errors import SettingsError

@@ -1,6 +1,6 @@
 """The front as a process: PMU streams in, frames out to the control process that has started it.
 
-``python -m dcon.platform.front --ini FILE --fd N --run-dir DIR``, with one end of a SEQPACKET socket pair inherited as
+``python -m dcon.front --ini FILE --fd N --run-dir DIR``, with one end of a SEQPACKET socket pair inherited as
 descriptor N. Its loops ``udp`` and ``parse`` take turns in one thread, and each beats to the watchdog. It never waits
 for the control process: data frames that the pair has no room for are counted; the newest configurations, and news, are
 kept. It ends when the pair does.
@@ -8,21 +8,12 @@ kept. It ends when the pair does.
 
 from __future__ import annotations
 
-import argparse
 import socket
-import sys
-from pathlib import Path
 
-from dcon.link.beats import LoopName
-from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, encode
-from dcon.link.paths import WATCHDOG, Sender
-from dcon.platform.pulse import Pulse
-from dcon.platform.receiving import Reception
-from dcon.settings import load
-from pmutools.clock import Clock, SystemClock
-from pmutools.errors import PmuError
-from pmutools.net.receiver import Receivers
-from pmutools.realtime import go_realtime
+from dcon.front.receiving import Reception
+from dcon.link.crossing import Counts, Item, PmuFrameIn, encode
+from dcon.link.pulse import Pulse
+from pmutools.clock import Clock
 
 ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
@@ -108,35 +99,3 @@ class Front:
             outlet.add(Counts(**vars(reception.counts)))  # it also finds out whether anybody is there
         outlet.flush()
         self._parse.beat(now_ns)
-
-
-def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="dcon.platform.front")
-    parser.add_argument("--ini", required=True)
-    parser.add_argument("--fd", type=int, required=True)
-    parser.add_argument("--run-dir", type=Path, required=True)
-    given = parser.parse_args(arguments)
-    sock = socket.socket(fileno=given.fd)
-    counts = Counts()
-    outlet = Outlet(sock, counts)
-    clock = SystemClock()
-    try:
-        settings = load(given.ini)
-        receivers = Receivers([site.endpoint for site in settings.sites], clock)
-    except PmuError as error:
-        outlet.add(Failure(str(error)))
-        outlet.flush()
-        return 1
-    reception = Reception(receivers, counts)
-    try:
-        sender = Sender(given.run_dir / WATCHDOG)
-        udp, parse = (Pulse(name, sender, BEAT_NS) for name in (LoopName.UDP, LoopName.PARSE))
-        go_realtime(fifo=settings.platform.fifo, priority=PRIORITY)
-        Front(reception, outlet, udp, parse, clock).run()
-    finally:
-        reception.close()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -3,7 +3,7 @@
 At the tick it takes the frames and news that have come, computes, drives the output, then logs. A tick consumes the
 frames that had arrived by its time, and the log says which they were; so a tick that runs late decides what it would
 have decided in time, and ticks that the machine slept through are made up for. Where frames, news, command and log come
-from and go to is its ends' affair (:mod:`dcon.platform.ports`).
+from and go to is its ends' affair (:mod:`dcon.control.ports`).
 
 The session ends at its time, when asked to, or where its ends are in trouble: the command ramps to 0 first, as after
 an operator's ``disarm``. Anything else that goes wrong ends it at once, but for a log that the disk has no room for:
@@ -18,16 +18,16 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from dcon.control.orders import OrderBook, TimedOrder
+from dcon.control.ports import Ends, Log, Told
+from dcon.control.schedule import TickGrid
+from dcon.control.waiting import Waiting
 from dcon.core.rows import CORE
 from dcon.core.system import ENGAGED, Trigger
 from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
 from dcon.link.command import RELAYS
 from dcon.link.crossing import Failure, Item, PmuFrameIn
-from dcon.platform.orders import OrderBook, TimedOrder
-from dcon.platform.ports import Ends, Log, Told
-from dcon.platform.schedule import TickGrid
-from dcon.platform.waiting import Waiting
 from dcon.session.codec import Timing
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from dcon.control.ports import Ends, Nowhere
 from dcon.drivers.udp_command import UdpCommandDriver
+from dcon.front.receiving import Reception
 from dcon.link.crossing import Item
-from dcon.platform.ports import Ends, Nowhere
-from dcon.platform.receiving import Reception
 from dcon.session.head import Head
 from dcon.session.parts import free_path
 from dcon.session.rolling import RollingWriter

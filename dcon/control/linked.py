@@ -12,20 +12,20 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+from dcon.control.news import Heard, hear, is_there, surroundings, watchdog_of
+from dcon.control.ports import Ends, Told
 from dcon.core.values import Order
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.beats import LoopName
 from dcon.link.bundle import Entry
+from dcon.link.children import Children
 from dcon.link.command import CommandOut, encode
 from dcon.link.crossing import Counts, Failure, Item, decode
 from dcon.link.paths import Sender
+from dcon.link.pulse import Pulse
 from dcon.link.shipper import Ring, Shipper
 from dcon.link.shipping import Shipping
-from dcon.platform.children import Children
-from dcon.platform.news import Heard, hear, is_there, surroundings, watchdog_of
-from dcon.platform.ports import Ends, Told
-from dcon.platform.pulse import Pulse
 from dcon.session.codec import Watchdog
 from dcon.session.encode import watchdog_entry
 from dcon.session.head import Head
@@ -217,9 +217,9 @@ class Linked:
         here = ("--ini", str(ini), "--run-dir", str(folder))
         try:
             with theirs:
-                front = ("-m", "dcon.platform.front", *here, "--fd", str(theirs.fileno()))
+                front = ("-m", "dcon.front", *here, "--fd", str(theirs.fileno()))
                 self._children.start("front", front, (theirs.fileno(),))
-            self._children.start("aides", ("-m", "dcon.platform.aides", *here))
+            self._children.start("aides", ("-m", "dcon.aides", *here))
         except BaseException:
             self.ends.close()
             raise

@@ -1,7 +1,7 @@
 """Where frames come from, what a tick is told, where the command goes and where the log goes.
 
-The control loop knows these four only. In one process they are sockets and a file (:mod:`dcon.platform.alone`); with a
-run folder they are the sockets of other processes (:mod:`dcon.platform.linked`). None of them may wait, but
+The control loop knows these four only. In one process they are sockets and a file (:mod:`dcon.control.alone`); with a
+run folder they are the sockets of other processes (:mod:`dcon.control.linked`). None of them may wait, but
 :meth:`Frames.wait` for its deadline.
 """
 

@@ -1,0 +1,56 @@
+"""The ``gui`` loop: signed orders of operators."""
+
+from __future__ import annotations
+
+import json
+import select
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from dcon.aides.aide import ROUND_S, Aide
+from dcon.aides.handing import Handing, Reply
+from dcon.aides.order_gate import OrderGate, Passed
+from dcon.link import paths
+from dcon.link.beats import LoopName
+from dcon.link.paths import Sender
+
+AGAIN_S = 0.005
+"""From one try to hand on an order to the next."""
+
+
+class GuiAide(Aide):
+    """Operators' orders."""
+
+    def __init__(self, gate: OrderGate, run_dir: Path) -> None:
+        """Raises SourceError where another process has the place."""
+        super().__init__(LoopName.GUI, run_dir)
+        self._inbox = paths.bind_datagram(run_dir, paths.AIDE)
+        self.gate = gate
+        self.handing = Handing()
+        self._run_dir = run_dir.resolve()
+
+    def round(self) -> None:
+        passed = Passed()
+        if select.select([self._inbox], [], [], AGAIN_S if len(self.handing) else ROUND_S)[0]:
+            with suppress(BlockingIOError):
+                passed = self.gate.take(self._inbox.recv(1 << 16), time.monotonic_ns(), time.time_ns())
+        now_ns = time.monotonic_ns()
+        self.handing.add(passed, now_ns)
+        replies = self.handing.send(self._control.send, now_ns)
+        if passed.reply is not None:
+            replies.append(Reply(passed.reply_to, passed.reply))
+        for path, said in replies:
+            self._reply(Path(path), said)
+
+    def _reply(self, where: Path, reply: dict[str, Any]) -> None:
+        """To a name in the run folder only: who writes to this loop must not have it write elsewhere."""
+        if where.name and where.parent.resolve() == self._run_dir:
+            sender = Sender(where)
+            sender.send(json.dumps(reply).encode())
+            sender.close()
+
+    def release(self) -> None:
+        super().release()
+        paths.release(self._inbox)

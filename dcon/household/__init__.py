@@ -1,0 +1,1 @@
+"""``dcon run``: starts the processes, starts again what ends, and ends them in order."""
