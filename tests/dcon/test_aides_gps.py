@@ -140,10 +140,10 @@ def test_a_real_gpsd_that_gets_a_fix_and_ends(tmp_path: Path) -> None:
             assert control.said("gps")[-1]["source"] == "gpsd" and "s apart" in control.said("gps")[-1]["detail"]
             beats_on(watchdog)
             gpsd.close()
-            wait_for(lambda: ages(control)[-1] > 2)
+            wait_for(lambda: ages(control)[-1] > 2, 30)
             assert "nobody listens" in control.said("gps")[-1]["detail"]
             beats_on(watchdog)
-        assert watchdog.beats("gps")[-1][2] == LoopState.ENDING
+        wait_for(lambda: watchdog.beats("gps")[-1][2] == LoopState.ENDING)
 
 
 @pytest.mark.realtime
