@@ -49,7 +49,7 @@ def command(
     An order is signed, and answered when a tick has taken it. estop goes to the watchdog too; release and reset open
     the way for closing its relays again, and arm nothing. Exit code 0: done; 1: refused, or nobody answers.
     """
-    from dcon.server.client import Client
+    from dcon.server.client import Client, ask
     from pmutools.errors import SettingsError
     from pmutools.net.endpoint import parse_endpoint
 
@@ -59,10 +59,10 @@ def command(
     if verb in LOOKS:
         if words:
             raise SettingsError(f"{verb} takes no value")
+        if verb == "status":
+            click.echo(show(ask(where, {"ask": "status"})))
+            return Exit.DONE
         with Client(where) as client:
-            if verb == "status":
-                click.echo(show(client.ask({"ask": "status"})))
-                return Exit.DONE
             client.send({"ask": "watch"})
             for status in client.answers():
                 click.echo(json.dumps(status) if as_json else _line(status))
@@ -105,11 +105,10 @@ def _signed(
 
 
 def _order(order: tuple[SignedOrder, bytes], where: Endpoint, talk: Talk, as_json: bool) -> int:
-    from dcon.server.client import Client
+    from dcon.server.client import ask
 
     wanted, signed = order
-    with Client(where) as client:
-        answer = client.ask({"signed": signed.decode()})
+    answer = ask(where, {"signed": signed.decode()})
     if as_json:
         click.echo(json.dumps(answer))
     if "accepted" in answer:

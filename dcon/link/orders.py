@@ -27,6 +27,8 @@ ANSWER_NS: Final = 2_000_000_000
 """An order that the controller has not spoken of for so long is answered with that."""
 REFUSALS_A_SECOND = 10
 """Refused orders that become inputs; more are counted."""
+TOO_OLD: Final = "too old: is the operator's clock right?"
+REPLAYED: Final = "replayed, or overtaken by a later order"
 _NS = 1_000_000_000
 
 
@@ -127,9 +129,9 @@ def _forbidden(case: _Case) -> bool:
 REFUSALS: Final[tuple[tuple[str, Callable[[_Case], bool]], ...]] = (
     ("unknown operator", _unknown),
     ("the signature does not hold", _forged),
-    ("too old: is the operator's clock right?", _old),
+    (TOO_OLD, _old),
     ("from the future: is the operator's clock right?", _future),
-    ("replayed, or overtaken by a later order", _replayed),
+    (REPLAYED, _replayed),
     ("not allowed to this operator", _forbidden),
 )
 """In this order; what is no order at all is refused before."""

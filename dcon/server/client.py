@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
-from dcon.link.orders import ANSWER_NS, Operator, SignedOrder, sign
+from dcon.link.orders import ANSWER_NS, REPLAYED, TOO_OLD, Operator, SignedOrder, sign
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, join_host
 from pmutools.timebase import NS
@@ -16,6 +17,16 @@ from pmutools.timebase import NS
 CONNECT_S = 3.0
 PATIENCE_S = ANSWER_NS / NS + 3.0
 LONGEST_ANSWER = 1 << 20
+TRIES = 3
+"""Connections made for one ask."""
+LEAST_S = 0.5
+"""The last of them waits for so long, whatever went before."""
+CROWDED_OUT = "others need this place"
+"""Error that a client is told whose place another takes."""
+
+
+class Ended(SourceError):
+    """The server was there, and ended the connection before it answered."""
 
 
 def order(
@@ -27,21 +38,44 @@ def order(
     is no order.
     """
     signed = sign(SignedOrder(by.name, now_ns, now_ns, name, value, text, why), by.key)
-    with Client(where) as client:
-        return client.ask({"signed": signed.decode()})
+    return ask(where, {"signed": signed.decode()})
+
+
+def ask(where: Endpoint, asked: dict[str, Any]) -> dict[str, Any]:
+    """Ask on a connection of its own, and on another where the server gave that to others before it answered.
+
+    An order is sent again as the very same bytes, so that it cannot be taken twice. Where one was perhaps taken before
+    and what it came to was not heard, the answer is ``{"unknown"}``. Raises SourceError as :class:`Client` does.
+    """
+    end_s = time.monotonic() + PATIENCE_S
+    for number in range(1, TRIES + 1):
+        try:
+            with Client(where, max(end_s - time.monotonic(), LEAST_S)) as client:
+                answer = client.ask(asked)
+        except Ended:
+            if number == TRIES:
+                raise
+            continue
+        if answer.get("error") != CROWDED_OUT:
+            break
+    if number > 1 and answer.get("refused") in (REPLAYED, TOO_OLD):
+        return {"unknown": "the connection ended before the answer; the order may have been taken: look at the status"}
+    return answer
 
 
 class Client:
     """A connection; raises SourceError where the server cannot be reached, or does not answer."""
 
-    def __init__(self, where: Endpoint) -> None:
+    def __init__(self, where: Endpoint, patience_s: float = PATIENCE_S) -> None:
+        """``patience_s``: how long an answer is waited for."""
         self._name = join_host(where.host, where.port)
         self._rest = b""
         try:
             self._sock = socket.create_connection((where.host, where.port), CONNECT_S)
         except OSError as error:
             raise SourceError(f"{self._name}: {error.strerror or error}; is dcon server running there?") from None
-        self._sock.settimeout(PATIENCE_S)
+        self._patience_s = patience_s
+        self._sock.settimeout(patience_s)
 
     def ask(self, asked: dict[str, Any]) -> dict[str, Any]:
         """Send, and await the answer."""
@@ -51,6 +85,8 @@ class Client:
     def send(self, asked: dict[str, Any]) -> None:
         try:
             self._sock.sendall(json.dumps(asked).encode() + b"\n")
+        except ConnectionError as error:
+            raise Ended(f"{self._name}: {error.strerror or error}") from None
         except OSError as error:
             raise SourceError(f"{self._name}: {error.strerror or error}") from None
 
@@ -73,11 +109,13 @@ class Client:
             try:
                 data = self._sock.recv(65536)
             except TimeoutError:
-                raise SourceError(f"{self._name}: no answer in {PATIENCE_S:g} s") from None
+                raise SourceError(f"{self._name}: no answer in {self._patience_s:.2g} s") from None
+            except ConnectionError as error:
+                raise Ended(f"{self._name}: {error.strerror or error}") from None
             except OSError as error:
                 raise SourceError(f"{self._name}: {error.strerror or error}") from None
             if not data:
-                raise SourceError(f"{self._name}: the server ended the connection")
+                raise Ended(f"{self._name}: the server ended the connection")
             self._rest += data
             if len(self._rest) > LONGEST_ANSWER:
                 raise SourceError(f"{self._name}: not what a dcon server says")

@@ -37,6 +37,8 @@ class Desk:
         self.reply_to = ""
         """Path of the socket that the platform's link may answer to."""
         self.pending = Pending()
+        self.proven: set[Hashable] = set()
+        """Askers of whom an order's signature held, until they are forgotten."""
         self.relayed = 0
 
     def ask(self, asker: Hashable, line: bytes, *, utc_ns: int, now_ns: int) -> dict[str, Any] | None:
@@ -70,6 +72,11 @@ class Desk:
                 return self.pending.refused(name, reason)
         return []
 
+    def forget(self, asker: Hashable) -> None:
+        """It is gone: nobody waits for its answers any more."""
+        self.pending.forget(asker)
+        self.proven.discard(asker)
+
     def close(self) -> None:
         self._aide.close()
         self._watchdog.close()
@@ -80,9 +87,13 @@ class Desk:
             return {"refused": f"longer than {LONGEST} bytes"}
         if not self._verifier.operators:
             return {"refused": "this server knows no operators: set keys in [server]"}
-        if self.pending.is_full:
-            return {"refused": "too many orders are on their way"}
-        told = self._tell_watchdog(signed, utc_ns)
+        order = self._verifier.verify(signed, utc_ns)
+        told = ""
+        if isinstance(order, SignedOrder):
+            self.proven.add(asker)
+            told = self._tell_watchdog(order)
+        if self.pending.is_full(proven=isinstance(order, SignedOrder)):
+            return {"refused": f"too many orders are on their way{told}"}
         self.relayed += 1
         message = {"kind": "signed", "order": signed.hex(), "reply_to": self.reply_to}
         if not self._aide.send(json.dumps(message).encode()):
@@ -90,10 +101,9 @@ class Desk:
         self.pending.add(asker, signed, now_ns, told)
         return None
 
-    def _tell_watchdog(self, signed: bytes, utc_ns: int) -> str:
+    def _tell_watchdog(self, order: SignedOrder) -> str:
         """Of what the watchdog was told, in words; "" for nothing. The controller judges the order for itself."""
-        order = self._verifier.verify(signed, utc_ns)
-        if not isinstance(order, SignedOrder) or order.name not in VERBS:
+        if order.name not in VERBS:
             return ""
         if not self._watchdog.send(encode_word(VERBS[order.name], order.who)):
             return "; nor can the watchdog"

@@ -1,7 +1,7 @@
 """Operators' connections: lines of JSON over TCP, every number bounded.
 
-A client that is too many takes the place of the one that has been silent for longest; one that reads too slowly
-misses statuses, and is cut off where it misses answers.
+A client that is too many takes the place of another, by :class:`Worth`; one that reads too slowly misses statuses, and
+is cut off where it misses answers.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import logging
 import selectors
 import socket
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
+from enum import IntEnum
 from typing import Any
 
+from dcon.server.client import CROWDED_OUT
 from dcon.server.desk import Desk
 from dcon.server.newest import to_json
 from dcon.server.pending import Answer
@@ -22,6 +24,10 @@ from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 MOST_CLIENTS = 32
+BACKLOG = 512
+"""Connections that wait to be accepted: what a client sends meanwhile is read with its acceptance."""
+GRACE_NS = NS
+"""A new client has so long to say what it wants."""
 LONGEST_LINE = 16 << 10
 """Bytes."""
 LINES_A_SECOND = 20
@@ -33,14 +39,28 @@ WATCHED_BYTES = 64 << 10
 """Beyond this a watching client gets no new status."""
 
 
+class Worth(IntEnum):
+    """Who makes room: the least; of equals one of the address with most places, and there who is silent for longest."""
+
+    SILENT = 0
+    WATCHES = 1
+    NEW = 2
+    """Not yet :data:`GRACE_NS` here, and does not watch."""
+    PROVEN = 3
+    """Has signed an order with a key that the server knows: nobody without one takes this place while others go."""
+    AWAITS = 4
+    """And what became of it is still to be told."""
+
+
 class Client:
     """One connection."""
 
-    def __init__(self, sock: socket.socket, number: int, now_ns: int) -> None:
+    def __init__(self, sock: socket.socket, host: str, number: int, now_ns: int) -> None:
         self.sock = sock
+        self.host = host
         self.number = number
         self.watches = False
-        self.heard_ns = self.drained_ns = now_ns
+        self.since_ns = self.heard_ns = self.drained_ns = now_ns
         self._in = bytearray()
         self._out = bytearray()
         self._recent: deque[int] = deque(maxlen=LINES_A_SECOND)
@@ -89,7 +109,7 @@ class Operators:
         wanted = resolve(where.host, where.port, datagram=False)
         self._desk = desk
         self._selector = selector
-        self._sock = listening_socket(wanted, 64, f"[server] listen {wanted}")
+        self._sock = listening_socket(wanted, BACKLOG, f"[server] listen {wanted}")
         family, sockaddr = self._sock.family, self._sock.getsockname()
         self.address = Address(family, sockaddr)
         self.clients: dict[int, Client] = {}
@@ -124,25 +144,40 @@ class Operators:
         self._selector.unregister(self._sock)
         self._sock.close()
 
-    def _accept(self, _events: int, now_ns: int, _utc_ns: int) -> None:
+    def _accept(self, _events: int, now_ns: int, utc_ns: int) -> None:
         try:
-            sock, _ = self._sock.accept()
+            sock, peer = self._sock.accept()
         except OSError:  # gone again, or too many files are open: it waits in the backlog
             return
         sock.setblocking(False)
-        if len(self.clients) >= MOST_CLIENTS:
-            self.turned_away += 1
-            awaited = self._desk.pending.awaits
-            oldest = min(self.clients.values(), key=lambda c: (c.watches or awaited(c.number), c.heard_ns))
-            self._say(oldest, {"error": "others need this place"})
-            self._end(oldest)
+        self._make_room(now_ns, utc_ns)
         self._number += 1
-        client = self.clients[self._number] = Client(sock, self._number, now_ns)
+        client = self.clients[self._number] = Client(sock, peer[0], self._number, now_ns)
 
         def ready(events: int, now_ns: int, utc_ns: int) -> None:
             self._ready(client, events, now_ns, utc_ns)
 
         self._selector.register(sock, selectors.EVENT_READ, ready)
+        self._read(client, now_ns, utc_ns)
+
+    def _make_room(self, now_ns: int, utc_ns: int) -> None:
+        """Have a place free. Whose turn it is to go is read first: what it has sent may be an order."""
+        while len(self.clients) >= MOST_CLIENTS:
+            places = Counter(client.host for client in self.clients.values())
+            going = min(self.clients.values(), key=lambda c: (self._worth(c, now_ns), -places[c.host], c.heard_ns))
+            worth = self._worth(going, now_ns)
+            self._read(going, now_ns, utc_ns)
+            if going.number in self.clients and self._worth(going, now_ns) == worth:
+                self.turned_away += 1
+                self._say(going, {"error": CROWDED_OUT})
+                self._end(going)
+
+    def _worth(self, client: Client, now_ns: int) -> Worth:
+        if client.number in self._desk.proven:
+            return Worth.AWAITS if self._desk.pending.awaits(client.number) else Worth.PROVEN
+        if client.watches:
+            return Worth.WATCHES
+        return Worth.NEW if now_ns - client.since_ns < GRACE_NS else Worth.SILENT
 
     def _ready(self, client: Client, events: int, now_ns: int, utc_ns: int) -> None:
         if client.number not in self.clients:
@@ -197,6 +232,6 @@ class Operators:
 
     def _end(self, client: Client) -> None:
         if self.clients.pop(client.number, None) is not None:
-            self._desk.pending.forget(client.number)
+            self._desk.forget(client.number)
             self._selector.unregister(client.sock)
             client.sock.close()

@@ -41,9 +41,9 @@ class Pending:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    @property
-    def is_full(self) -> bool:
-        return len(self._waiting) >= MOST
+    def is_full(self, *, proven: bool) -> bool:
+        """Half of the room is for orders whose signature holds."""
+        return len(self._waiting) >= (MOST if proven else MOST // 2)
 
     def add(self, asker: Hashable, signed: bytes, now_ns: int, told: str = "") -> None:
         """An order was relayed; ``now_ns`` on a clock without steps."""

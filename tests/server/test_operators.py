@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import random
 import socket
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,10 +21,11 @@ from dcon.cli import dcon
 from dcon.cli.ctl import relays_line
 from dcon.link import paths
 from dcon.link.keys import add_key, read_keys
-from dcon.link.orders import SignedOrder, sign
+from dcon.link.orders import REPLAYED, SignedOrder, sign
 from dcon.link.paths import bind_datagram, prepare
+from dcon.server import client as client_side
 from dcon.server import operators
-from dcon.server.client import Client
+from dcon.server.client import Client, order
 from dcon.session.codec import Watchdog
 from dcon.session.reader import SessionReader
 from pmutools.cli.shell import run
@@ -231,11 +234,109 @@ def test_garbage_floods_and_idle_clients_leave_an_operator_served(site: Site) ->
         sock.close()
 
 
+class Crowd:
+    """Clients without a key, each in a thread that ends with this: they connect and hold, watch, or flood lines."""
+
+    def __init__(self, port: int) -> None:
+        self.where = ("127.0.0.1", port)
+        self.made = 0
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=self._hold), threading.Thread(target=self._flood)]
+
+    def __enter__(self) -> Crowd:
+        self._watching = [socket.create_connection(self.where, 5) for _ in range(31)]
+        for sock in self._watching:
+            sock.sendall(b'{"ask":"watch"}\n')
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+        for sock in self._watching:
+            sock.close()
+
+    def _hold(self) -> None:
+        held: deque[socket.socket] = deque()
+        while not self._over.is_set():
+            with suppress(OSError):
+                held.append(socket.create_connection(self.where, 5))
+                self.made += 1
+                if self.made % 3 == 0:
+                    held[-1].sendall(b'{"ask":"watch"}\n')
+            if len(held) > 64:
+                held.popleft().close()
+        for sock in held:
+            sock.close()
+
+    def _flood(self) -> None:
+        while not self._over.is_set():
+            with suppress(OSError), socket.create_connection(self.where, 5) as sock:
+                while not self._over.is_set():
+                    sock.sendall(b'{"ask":"key"}\n' * 10)
+
+
+def test_whoever_crowds_in_every_signed_order_is_answered_and_taken_once(site: Site) -> None:
+    before = len(site.platform.taken)
+    with Crowd(site.server.port) as crowd:
+        operator = read_keys(site.keys)["Ada"]
+        answers = [order(site.where, operator, "estop", text=str(n), now_ns=time.time_ns()) for n in range(100)]
+        assert crowd.made > 100
+    assert [answer.get("accepted") for answer in answers] == ["estop"] * 100
+    assert [taken.text for taken in site.platform.taken[before:]] == [str(n) for n in range(100)]
+    assert site.status()["server"]["clients"] <= operators.MOST_CLIENTS
+
+
+def test_a_proven_client_keeps_its_place(site: Site) -> None:
+    with Client(site.where) as client:
+        assert client.ask({"signed": site.signed()})["accepted"] == "arm"
+        with Crowd(site.server.port) as crowd:
+            site.until(lambda: crowd.made > 100)
+            assert client.ask({"signed": site.signed()})["accepted"] == "arm"
+
+
+@pytest.mark.parametrize(
+    ("answers", "becomes"),
+    [
+        ([{"error": client_side.CROWDED_OUT}, None, {"accepted": "arm"}], {"accepted": "arm"}),
+        ([None, {"refused": REPLAYED}], "unknown"),
+        ([{"refused": REPLAYED}], {"refused": REPLAYED}),
+        ([None, {"refused": "not in STANDBY"}], {"refused": "not in STANDBY"}),
+        ([{"error": client_side.CROWDED_OUT}] * 3, {"error": client_side.CROWDED_OUT}),
+        ([None] * 3, client_side.Ended),
+    ],
+)
+def test_who_loses_its_place_asks_again_with_the_same_bytes(answers: list[dict[str, Any] | None], becomes: Any) -> None:
+    heard = []
+
+    def serve() -> None:
+        for answer in answers:
+            sock, _ = listener.accept()
+            with sock, sock.makefile("rwb") as file:
+                heard.append(file.readline())
+                file.write(b"" if answer is None else json.dumps(answer).encode() + b"\n")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        where = Endpoint(Scheme.TCP, *listener.getsockname())
+        server = threading.Thread(target=serve)
+        server.start()
+        if isinstance(becomes, type):
+            with pytest.raises(becomes):
+                client_side.ask(where, {"signed": "it"})
+        else:
+            said = client_side.ask(where, {"signed": "it"})
+            assert "may have been taken" in said["unknown"] if becomes == "unknown" else said == becomes
+        server.join()
+    assert heard == [b'{"signed": "it"}\n'] * len(answers)
+
+
 def test_a_client_that_does_not_read_is_known_by_what_waits() -> None:
     """Its answers may not pile up for ever, and a status is not sent after one that waits."""
     ours, theirs = socket.socketpair()
     ours.setblocking(False)
-    client = operators.Client(ours, 1, 0)
+    client = operators.Client(ours, "", 1, 0)
     said = 0
     while client.say(bytes(1000)):
         said += 1
