@@ -10,6 +10,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import MISSING, Field, fields
 from typing import Any, Final, NamedTuple
 
+from dcon.core.idle import idle_checks
+from dcon.redundancy import single_safeguards
 from dcon.settings import ELSEWHERE, PARAMS, RATE_HZ, Settings, every_pair
 
 GIVEN: Final = "initialisation file"
@@ -30,6 +32,11 @@ UNITS: Final = {
 }
 """By how the key ends, the first that fits, where the metadata has no ``unit``."""
 NOT_SET: Final = "not set"
+
+
+def warnings_of(settings: Settings) -> list[str]:
+    """One line for each check that cannot fire, and each safeguard that one failure defeats."""
+    return idle_checks(settings.params) + single_safeguards(settings)
 
 
 class Effective(NamedTuple):

@@ -153,22 +153,26 @@ def destination(text: str) -> Destination:
             if keys.type == "int16" and keys.counts_per_v * FULL_SCALE_V > INT16_MAX:
                 raise ValueError(f"{text}: scale={keys.counts_per_v:g} takes 10 V beyond {INT16_MAX}; 3276 is the most")
             return ModbusPlace(host, port, keys)
-    where = endpoint(text)
-    if where.scheme is not Scheme.UDP or not where.port:
-        raise ValueError(f"{text}: commands leave as udp://HOST:PORT, iio://FOLDER or modbus://HOST:PORT")
-    return where
+    return _datagrams(text, "commands leave as udp://HOST:PORT, iio://FOLDER or modbus://HOST:PORT")
 
 
 def line_source(text: str) -> LineSource:
     """The URL of ``[pdci]``. Raises ValueError."""
     if text.strip().startswith("modbus://"):
         return ModbusLine(*_modbus(text.strip(), StatusRegisters))
-    where = endpoint(text)
-    if where.scheme is not Scheme.UDP or not where.port:
-        raise ValueError(
-            f"{text}: the line's status comes by udp://HOST:PORT (an address of this machine) or modbus://"
-        )
-    return where
+    return _datagrams(text, "the line's status comes by udp://HOST:PORT (an address of this machine) or modbus://")
+
+
+def _datagrams(text: str, places: str) -> Endpoint:
+    """``udp://HOST:PORT``; ``places`` says what else may be written."""
+    try:
+        parts = urlsplit(text.strip())
+        has_port = parts.scheme == Scheme.UDP and bool(parts.port)
+    except ValueError:
+        has_port = False
+    if not has_port:
+        raise ValueError(f"{text}: {places}")
+    return endpoint(text)
 
 
 def _iio(text: str) -> IioPlace:

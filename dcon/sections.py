@@ -16,9 +16,14 @@ TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
 
 
 def _listening(text: str) -> Endpoint:
-    where = endpoint(text if "://" in text else f"tcp://{text}")
-    if where.scheme is not Scheme.TCP or not where.port:
-        raise ValueError(f"{text}: operators connect to HOST:PORT, over TCP")
+    try:
+        where = endpoint(text if "://" in text else f"tcp://{text}")
+    except ValueError:
+        where = None
+    if where is None or where.scheme is not Scheme.TCP or not where.port:
+        port = text if text.isdecimal() else 4790
+        remedy = f"write HOST:PORT, as in 127.0.0.1:{port}; an IPv6 address stands in brackets"
+        raise ValueError(f"{text}: operators connect over TCP; {remedy}")
     return where
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -15,6 +14,7 @@ from dcon.core.params import RATES, Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
+from dcon.redundancy import check_redundancy, is_same_file
 from dcon.sections import LineInput, Log, Output, Platform, Server, Watchdog
 from pmutools.errors import SettingsError
 from pmutools.parsers import Parser, boolean, choice, integer, number, suggestion, words
@@ -65,6 +65,10 @@ def load(path: str | Path) -> Settings:
     ini, text = read_ini(path)
     settings = from_ini(ini, text)
     _spared(settings, ini, path)
+    try:
+        check_redundancy(settings)
+    except Clash as clash:
+        raise _placed(clash, ini, "watchdog") from None
     most = settings.params.gain_max_mw_per_mhz
     if most > GAIN_MAX:
         where = ini.section("controller").entries["gain_max_mw_per_mhz"].where
@@ -76,20 +80,33 @@ def _spared(settings: Settings, ini: Ini, path: str | Path) -> None:
     """Raise SettingsError where what is written is a file that is read, under whatever name."""
     read = {"the initialisation file": path, "the probing signal": settings.params.probing.file}
     read["the file of keys"] = settings.server.keys or ""
-    for section, key, written in (("log", "path", settings.log.path), ("watchdog", "log", settings.watchdog.log)):
+    files = [("watchdog", key, getattr(settings.watchdog, key)) for key in ("log", "relay_a", "relay_b")]
+    for section, key, written in [("log", "path", settings.log.path), *files]:
         for what, name in read.items():
-            if all(place and os.path.exists(place) for place in (written, name)) and os.path.samefile(written, name):
+            if written and name and is_same_file(written, str(name)):
                 entry = ini.section(section).entries.get(key)
                 where = ini.section(section).where._replace(key=key) if entry is None else entry.where
                 raise where.error(f"{written} is {what}, and would be overwritten; write to another file")
 
 
-def parse(text: str, source: str, changes: tuple[str, ...] = (), *, probe_file: bytes | None = None) -> Settings:
+def parse(
+    text: str,
+    source: str,
+    changes: tuple[str, ...] = (),
+    *,
+    probe_file: bytes | None = None,
+    defaults: tuple[str, ...] = (),
+) -> Settings:
     """Settings of an INI text, of a simulation or a replay; ``changes`` are ``SECTION.KEY=VALUE`` laid over it.
 
-    ``probe_file`` is what the file of ``[probing]`` held; it is read where that is None.
+    ``probe_file`` is what the file of ``[probing]`` held; it is read where that is None. ``defaults``, written as
+    ``changes`` are, count where the text does not say otherwise.
     """
     ini = parse_ini(text, source, defaults_for="pmu")
+    for default in defaults:
+        section, _, key = default.partition("=")[0].rpartition(".")
+        if key not in ini.section(section).entries:
+            ini = ini.changed(default, "a former default")
     for change in changes:
         ini = ini.changed(change)
         if change.partition("=")[0].strip().lower() == PROBE_FILE:
@@ -189,7 +206,7 @@ def _params(ini: Ini, sites: tuple[Site, ...], required: Required, probing: Prob
     priority = entries.pop("priority", None)
     given = _numbers(Params, Section(section.name, section.where, entries), skip=ELSEWHERE)
     thresholds = _filled(Thresholds, ini.section("supervisor"))
-    line = _filled(Line, _split(ini.section("pdci"), LineInput)[1])
+    line = _filled(Line, _split(ini.section("pdci"), LineInput)[1], known=[item.name for item in fields(LineInput)])
     instances = every_pair(ini.source, sites) if priority is None else _priority(sites, priority)
     gain, most = (given.get(key, PARAMS[key].default) for key in ("gain_mw_per_mhz", "gain_max_mw_per_mhz"))
     if gain > most:
@@ -223,9 +240,9 @@ def _split(section: Section, cls: type) -> tuple[Section, Section]:
     return Section(section.name, section.where, mine), Section(section.name, section.where, others)
 
 
-def _filled(cls: type[T], section: Section) -> T:
+def _filled(cls: type[T], section: Section, known: Collection[str] = ()) -> T:
     """A dataclass of a section."""
-    return _made(cls, section, _numbers(cls, section))
+    return _made(cls, section, _numbers(cls, section, known=known))
 
 
 def _made(cls: type[T], section: Section, values: dict[str, Any]) -> T:
@@ -247,14 +264,17 @@ def _placed(clash: Clash, ini: Ini, section: str) -> SettingsError:
     return ini.section(section).where.error(clash)
 
 
-def _numbers(cls: type, section: Section, skip: Collection[str] = ()) -> dict[str, Any]:
-    """Values of a section for a dataclass whose fields carry bounds or choices as metadata, by the defaults' types."""
-    known = {item.name: item for item in fields(cls) if item.name not in skip}
+def _numbers(cls: type, section: Section, skip: Collection[str] = (), known: Collection[str] = ()) -> dict[str, Any]:
+    """Values of a section for a dataclass whose fields carry bounds or choices as metadata, by the defaults' types.
+
+    ``known`` are keys of the section that are not the dataclass's, for the words about one that is unknown.
+    """
+    mine = {item.name: item for item in fields(cls) if item.name not in skip}
     values: dict[str, Any] = {}
     for key, entry in section.entries.items():
-        if key not in known:
-            raise entry.where.error(f"unknown key; {suggestion(key, known)}")
-        item = known[key]
+        if key not in mine:
+            raise entry.where.error(f"unknown key; {suggestion(key, (*known, *mine))}")
+        item = mine[key]
         parse: Parser[Any]
         if isinstance(item.default, bool):
             parse = boolean

@@ -17,15 +17,14 @@ def command(ini: str, as_json: bool, quiet: bool, verbose: int) -> None:
     """Read an initialisation file as the controller would, and print what is in force.
 
     Each setting with its unit, where its value comes from, and the default where that is another. A warning names each
-    check that cannot fire at the present limit of the command.
+    check that cannot fire at the present limit of the command, and each safeguard that one failure defeats.
     """
-    from dcon.core.idle import idle_checks
-    from dcon.effective import effective
+    from dcon.effective import effective, warnings_of
     from dcon.settings import load
     from pmutools.sites import Site
 
     settings = load(ini)
-    rows, warnings = effective(settings), idle_checks(settings.params)
+    rows, warnings = effective(settings), warnings_of(settings)
     if as_json:
         sites = [
             {key.name: _plain(value) for key in fields(Site) if (value := getattr(site, key.name)) is not None}

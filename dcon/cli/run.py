@@ -45,13 +45,15 @@ def command(
     """
     if sys.platform != "linux":
         raise SettingsError("dcon run needs Linux; dcon platform alone runs elsewhere too")
-    from dcon.household.household import Household
+    from dcon.effective import warnings_of
     from dcon.link.notify import Notifier
     from dcon.settings import load
     from pmutools.timebase import NS, format_utc, parse_utc
 
     talk = Talk(quiet, verbose)
     settings = load(ini)
+    for warning in warnings_of(settings):
+        talk.say(f"warning: {warning}")
     try:
         start_ns = None if start is None else parse_utc(start)
     except ValueError as error:

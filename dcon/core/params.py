@@ -51,7 +51,7 @@ class Line:
     """Largest power south to north."""
     minimum_mw: float = setting(310.0, "MW", "choice: 10 % of the rating", 0, 1e5)
     """Smallest power that the line carries, in either direction."""
-    status_age_s: float = setting(10.0, "s", "choice", 0, 3600)
+    status_age_s: float = setting(2.0, "s", "choice: four of the 0.5 s at which a device is asked", 0, 3600)
     """A status older than this is not known."""
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ import pmutools
 from dcon.core.values import Order, Record
 from dcon.engine import Engine, Tick
 from dcon.session import codec
+from dcon.session.defaults import former
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
 from dcon.session.reader import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
@@ -158,7 +159,8 @@ def replay(
         )
     if not reader.ini_text:
         raise SourceError(f"{reader.path}: the log holds no initialisation file (its beginning is lost), so no replay")
-    settings = parse(reader.ini_text, f"{reader.path}: {_INI}", tuple(changes), probe_file=reader.probe_file)
+    name, defaults = f"{reader.path}: {_INI}", former(reader.metadata)
+    settings = parse(reader.ini_text, name, tuple(changes), probe_file=reader.probe_file, defaults=defaults)
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
     result = Replay(changes=tuple(changes))
     before = "the session begins"

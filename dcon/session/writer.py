@@ -12,6 +12,7 @@ from typing import IO
 
 import pmutools
 from dcon.link.bundle import Entry
+from dcon.session import defaults
 from dcon.session.head import INI_NAME, PROBE_NAME, Head
 from dcon.session.parts import SESSION
 from pmutools.schema.log_writer import LogWriter
@@ -38,7 +39,8 @@ class SessionWriter:
         self._tick_ns: int | None = None
         self._log = LogWriter(target)
         self._pmus = PmuTopics(self._log)
-        self._log.metadata(SESSION, {"version": pmutools.__version__, **head.metadata, **head.names})
+        own = {"version": pmutools.__version__, defaults.KEY: str(defaults.NUMBER)}
+        self._log.metadata(SESSION, {**own, **head.metadata, **head.names})
         self._log.attach(INI_NAME, head.ini_text.encode(), media_type="text/plain")
         if head.probe_file:
             self._log.attach(PROBE_NAME, head.probe_file, media_type="text/csv")

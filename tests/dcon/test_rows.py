@@ -383,7 +383,7 @@ def test_bias(mw: float, up: bool) -> None:
 
 # --- the surroundings --------------------------------------------------------------------------------------------
 
-STATUS = Pdci(START_NS + 10_000_000_000, 1500.0, scheduled_mw=1500.0)
+STATUS = Pdci(START_NS + 12_000_000_000, 1500.0, scheduled_mw=1500.0)
 TOLD_CASES: dict[str, tuple[str, Surroundings, Surroundings]] = {
     "GPS": ("gps", Surroundings(gps_age_s=5.0), Surroundings(gps_age_s=5.001)),
     "watchdog": ("watchdog", Surroundings(watchdog_healthy=True), Surroundings(watchdog_healthy=False)),

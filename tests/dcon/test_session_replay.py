@@ -11,12 +11,15 @@ import pytest
 from support.sessions import log_tick
 
 from dcon.cli import dcon
-from dcon.core.values import Event, Order, Record
+from dcon.core.values import Event, Order, Pdci, Record, Surroundings
+from dcon.engine import Engine
 from dcon.session import codec
+from dcon.session.defaults import former
 from dcon.session.head import Head
 from dcon.session.reader import LoggedTick, SessionReader
 from dcon.session.replay import identical, replay
 from dcon.session.writer import SessionWriter
+from dcon.settings import parse
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run
@@ -394,3 +397,22 @@ def test_a_damaged_configuration_is_a_problem_that_is_told(session: Path, tmp_pa
             log_tick(log, tick.record, tick.frames, tick.orders, instances=reader.instances)
     code, _, err = told(capsys, str(path))
     assert code == 3 and "N1: CHK is" in err
+
+
+@pytest.mark.parametrize(("metadata", "different"), [({"defaults": "1"}, 0), ({}, 1)])
+def test_a_log_is_replayed_with_the_defaults_that_it_was_recorded_under(
+    metadata: dict[str, str], different: int, tmp_path: Path
+) -> None:
+    """A status of the line 5 s old counted by default as known, and does no more."""
+    text = "[pmu A]\nurl = udp://h:1\nside = north\n[pmu B]\nurl = udp://h:2\nside = south\n"
+    settings = parse(text, "x", ("pdci.status_age_s=10",))
+    engine = Engine(settings.params, settings.sites)
+    tick_ns = 1_700_000_000 * 10**9
+    told = Surroundings(pdci=Pdci(tick_ns - 5 * 10**9, 2000.0, False, True, 2000.0))
+    tick = engine.tick({}, (), tick_ns, told)
+    path = tmp_path / "x.mcap"
+    names = settings.params.instance_names
+    with SessionWriter(path, Head(text, ("A", "B"), names, metadata=metadata)) as log:
+        log_tick(log, tick.record, instances=names, pdci=told.pdci, surroundings=told)
+    assert former({}) == former({"defaults": "1"}) == ("pdci.status_age_s=10",) and former({"defaults": "2"}) == ()
+    assert replay(path).different == different

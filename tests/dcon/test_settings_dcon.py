@@ -281,7 +281,27 @@ MISTAKES = {
     "operators over UDP": (
         "[server]",
         "[server]\nlisten = udp://127.0.0.1:4790",
-        "dcon.ini:34: [server] listen: udp://127.0.0.1:4790: operators connect to HOST:PORT, over TCP",
+        "dcon.ini:34: [server] listen: udp://127.0.0.1:4790: operators connect over TCP; write HOST:PORT,",
+    ),
+    "operators at a port": (
+        "[server]",
+        "[server]\nlisten = 4790",
+        "dcon.ini:34: [server] listen: 4790: operators connect over TCP; write HOST:PORT, as in 127.0.0.1:4790;",
+    ),
+    "commands by another scheme": (
+        "url = udp://192.0.2.30:4790",
+        "url = http://x",
+        "dcon.ini:35: [output] url: http://x: commands leave as udp://HOST:PORT, iio://FOLDER or modbus://HOST:PORT",
+    ),
+    "commands without a port": (
+        "url = udp://192.0.2.30:4790",
+        "url = udp://x",
+        "dcon.ini:35: [output] url: udp://x: commands leave as udp://HOST:PORT, iio://FOLDER or modbus://HOST:PORT",
+    ),
+    "a key of the line that is none": (
+        "[pdci]",
+        "[pdci]\nfrom = x",
+        "dcon.ini:37: [pdci] from: unknown key; known: url, required, rating_ns_mw,",
     ),
     "orders that never grow old": (
         "[server]",
