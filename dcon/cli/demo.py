@@ -51,7 +51,7 @@ def command(
         picture = f", picture {summary['picture']}" if summary["picture"] else ""
         click.echo(f"session log {summary['session']}, summary {out / 'summary.json'}{picture}")
     if summary["picture"] is None:
-        talk.say("no picture: matplotlib is not installed; pip install 'pmutools[analysis]' brings it")
+        talk.say("no picture: matplotlib is not installed; pip install '.[analysis]' in a checkout brings it")
     opened, closed = summary["open_loop"], summary["closed_loop"]
     if opened is None or closed is None:
         click.echo("dcon demo: the swings could not be judged; is the machine overloaded?", err=True)

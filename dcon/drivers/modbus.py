@@ -63,7 +63,9 @@ class Bus:
         try:
             from pymodbus.client import ModbusTcpClient
         except ImportError:
-            raise SettingsError("modbus:// needs pymodbus; install it with: pip install 'pmutools[modbus]'") from None
+            raise SettingsError(
+                "modbus:// needs pymodbus; install it with: pip install '.[modbus]' in a checkout"
+            ) from None
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what fails is told here, once
         self._where, self._unit = join_host(host, port), unit
         self._client: Any = ModbusTcpClient(host, port=port, timeout=timeout_s, retries=0)

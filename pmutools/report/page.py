@@ -92,7 +92,7 @@ def require_extra() -> None:
             import_module(name)
         except ImportError:
             raise SettingsError(
-                f"a report needs {name}, which is not installed: pip install 'pmutools[analysis]' brings it"
+                f"a report needs {name}, which is not installed: pip install '.[analysis]' in a checkout brings it"
             ) from None
 
 

@@ -374,8 +374,8 @@ SHORT = [
 
 STRICT = replace(PARAMS, required=Required(True, True, True), line=Line(required=True))
 STATUS = Pdci(T, 1500.0)
-OLD = STATUS._replace(time_ns=T - 10_000_000_000)
-OLDER = STATUS._replace(time_ns=T - 10_000_000_001)
+OLD = STATUS._replace(time_ns=T - 2_000_000_000)
+OLDER = STATUS._replace(time_ns=T - 2_000_000_001)
 
 
 def view(**changed: Any) -> SystemView:
