@@ -84,6 +84,8 @@ class Summary:
     crowded: int = 0
     """Frames that came in a flood, or while the loop stood still, and found no room to wait; those of a PMU whose
     configuration had to."""
+    unreadable_yet: int = 0
+    """Frames that came more than a second before the first configuration of their PMU."""
     overtaken_configs: int = 0
     """Configurations that a newer one of their PMU replaced before they were taken."""
     unsent: int = 0
@@ -275,6 +277,7 @@ class Platform:
         summary.unread = dict(self.engine.unread)
         summary.final_state = str(self.engine.state.system)
         summary.foreign, summary.undecodable, summary.own_drops = counts.foreign, counts.undecodable, counts.own_drops
+        summary.unreadable_yet = counts.unreadable_yet
         summary.crowded = counts.crowded + self._waiting.crowded
         summary.overtaken_configs = self._waiting.overtaken
         summary.unsent = self.ends.command.failed

@@ -16,6 +16,10 @@ from pmutools.c37118.constants import MAX_FRAME_SIZE
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.net.receiver import Receivers
+from pmutools.timebase import NS
+
+HELD_NS = NS
+"""Frames that came so long before the first configuration of their PMU are too old to control by."""
 
 
 class Reception:
@@ -25,6 +29,8 @@ class Reception:
         self.receivers = receivers
         self.counts = Counts() if counts is None else counts
         self._configs: dict[int, StreamConfig] = {}
+        self._since_ns: dict[int, int] = {}
+        """By PMU, from which arrival on its frames count: what was held for its first configuration may be old."""
         self._refused: set[int] = set()
         """Whose newest configuration cannot be handed on: their data would be read by an older one."""
 
@@ -52,10 +58,13 @@ class Reception:
             if frame.type is FrameType.DATA:
                 if owner in self._refused:
                     self.counts.undecodable += 1
+                elif (frame.arrival_ns or 0) < self._since_ns.get(owner, 0):
+                    self.counts.unreadable_yet += 1
                 else:
                     take(PmuFrameIn(owner, frame))
             elif config is not None and frame.type.rules_data and self._configs.get(owner) != config:
                 self._configs[owner] = config
+                self._since_ns.setdefault(owner, (frame.arrival_ns or 0) - HELD_NS)
                 take(self._handed_on(owner, message, config))
 
     def _handed_on(self, owner: int, message: Message, config: StreamConfig) -> Item:

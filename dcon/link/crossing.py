@@ -54,6 +54,8 @@ class Counts:
     """Datagrams that a full receive buffer of this machine has lost."""
     crowded: int = 0
     """Frames that the control process did not take in time."""
+    unreadable_yet: int = 0
+    """Frames that came more than a second before the first configuration of their PMU."""
 
 
 class PmuFrameIn(NamedTuple):

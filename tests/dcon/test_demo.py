@@ -149,7 +149,7 @@ def test_without_matplotlib_there_is_a_summary_and_a_word(
     assert run(dcon(), ["demo", "--out", str(closed)]) == 0
     out, err = capsys.readouterr()
     assert "11.4 %" in out and "picture" not in out
-    assert "no picture: matplotlib is not installed; pip install 'pmutools[analysis]'" in err
+    assert "no picture: matplotlib is not installed; pip install '.[analysis]'" in err
     assert json.loads((closed / "summary.json").read_text())["picture"] is None
 
 

@@ -158,7 +158,7 @@ def test_answers_that_are_none(reply: Callable[[bytes], bytes]) -> None:
 def test_without_pymodbus_it_is_one_line_that_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pymodbus.client", None)
     with pytest.raises(
-        SettingsError, match=r"^modbus:// needs pymodbus; install it with: pip install 'pmutools\[modbus\]'$"
+        SettingsError, match=r"^modbus:// needs pymodbus; install it with: pip install '\.\[modbus\]' in a checkout$"
     ):
         ModbusDriver(ModbusPlace("127.0.0.1", 502))
 

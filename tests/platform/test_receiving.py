@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from support.virtual_platform import FLOWS, STREAMS, Clock, Script
 
@@ -13,6 +14,7 @@ from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import PhasorChannel, encode_config
 from pmutools.flow import Chunk, StampSource
 from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.timebase import NS
 
 
 def long_config(phasors: int = 300) -> StreamConfig:
@@ -67,3 +69,17 @@ def test_one_longer_than_a_frame_is_refused_and_told_and_its_data_are_no_more_re
     assert rig(bytes(long_data) + chk(bytes(long_data)).to_bytes(2, "big")) == []
     assert rig.reception.counts.undecodable == 2
     assert [getattr(item, "is_config", None) for item in rig(encode_config(short), data)] == [True, False]
+
+
+def test_what_was_held_for_a_first_configuration_counts_by_a_name_of_its_own_once_it_is_old() -> None:
+    rig = Rig()
+    found: list[Any] = []
+    data = STREAMS.data("N1", STREAMS.stamp_ns(0))
+    arrivals_ns = [*range(0, 60 * NS, NS // 10), 60 * NS]
+    for arrival_ns in arrivals_ns:
+        frame = encode_config(STREAMS.configs["N1"]) if arrival_ns == 60 * NS else data
+        chunk = Chunk(frame, arrival_ns, FLOWS["N1"], StampSource.KERNEL)
+        rig.reception.parse([chunk], found.append)
+    assert [item.is_config for item in found] == [True, *[False] * 10]
+    assert [item.frame.arrival_ns for item in found[1:]] == arrivals_ns[-11:-1]
+    assert rig.reception.counts.unreadable_yet == 590 and rig.reception.counts.undecodable == 0

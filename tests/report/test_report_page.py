@@ -289,7 +289,7 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) ->
     for name in ("jinja2", "plotly", "matplotlib"):
         with monkeypatch.context() as patched:
             patched.setitem(sys.modules, name, None)
-            with pytest.raises(SettingsError, match=rf"needs {name}.*pip install 'pmutools\[analysis\]'"):
+            with pytest.raises(SettingsError, match=rf"needs {name}.*pip install '\.\[analysis\]'"):
                 write_report(run_of([Made("N1", 1)]), Path("nowhere"))
     assert not Path("nowhere").exists()
 
