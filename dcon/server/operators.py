@@ -26,12 +26,15 @@ LOG = logging.getLogger(__name__)
 MOST_CLIENTS = 32
 BACKLOG = 512
 """Connections that wait to be accepted: what a client sends meanwhile is read with its acceptance."""
+ACCEPTED_A_ROUND = 8
+"""Before others have their turn: fewer than there are places, so that a new one is heard before it can lose its own."""
 GRACE_NS = NS
 """A new client has so long to say what it wants."""
 LONGEST_LINE = 16 << 10
 """Bytes."""
 LINES_A_SECOND = 20
 """Of one client; more are answered with an error."""
+TOO_FAST = to_json({"error": f"more than {LINES_A_SECOND} lines in a second"})
 IDLE_NS = 60 * NS
 WAITING_BYTES = 256 << 10
 """To be sent to one client; beyond this it is cut off."""
@@ -145,14 +148,18 @@ class Operators:
         self._sock.close()
 
     def _accept(self, _events: int, now_ns: int, utc_ns: int) -> None:
-        try:
-            sock, peer = self._sock.accept()
-        except OSError:  # gone again, or too many files are open: it waits in the backlog
-            return
+        for _ in range(ACCEPTED_A_ROUND):
+            try:
+                sock, peer = self._sock.accept()
+            except OSError:  # none is left, it is gone again, or too many files are open: it waits in the backlog
+                return
+            self._welcome(sock, peer[0], now_ns, utc_ns)
+
+    def _welcome(self, sock: socket.socket, host: str, now_ns: int, utc_ns: int) -> None:
         sock.setblocking(False)
         self._make_room(now_ns, utc_ns)
         self._number += 1
-        client = self.clients[self._number] = Client(sock, peer[0], self._number, now_ns)
+        client = self.clients[self._number] = Client(sock, host, self._number, now_ns)
 
         def ready(events: int, now_ns: int, utc_ns: int) -> None:
             self._ready(client, events, now_ns, utc_ns)
@@ -204,14 +211,18 @@ class Operators:
             self._say(client, {"error": f"a line is longer than {LONGEST_LINE} bytes"})
             self._end(client)
             return
+        too_fast = 0
         for line in lines:
-            if client.number in self.clients:
+            if client.number not in self.clients:
+                return
+            if client.is_too_fast(now_ns):
+                too_fast += 1
+            else:
                 self._ask(client, line, now_ns, utc_ns)
+        if too_fast and client.number in self.clients:  # at once: a flood of lines must not take the time of others
+            self._after(client, client.say(TOO_FAST * too_fast))
 
     def _ask(self, client: Client, line: bytes, now_ns: int, utc_ns: int) -> None:
-        if client.is_too_fast(now_ns):
-            self._say(client, {"error": f"more than {LINES_A_SECOND} lines in a second"})
-            return
         answer = self._desk.ask(client.number, line, utc_ns=utc_ns, now_ns=now_ns)
         if answer == {"watch": True}:
             client.watches = True
