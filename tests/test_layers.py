@@ -30,7 +30,7 @@ LAYERS = [
     ["dcon", "dcon.limiter"],
     ["dcon.core", "dcon.places"],
     ["dcon.link"],
-    ["dcon.supervisor", "dcon.watchdog"],
+    ["dcon.watchdog"],
     ["dcon.sections", "dcon.frontend", "dcon.redundancy"],
     ["dcon.settings"],
     ["dcon.effective", "dcon.engine"],

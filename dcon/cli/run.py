@@ -46,6 +46,7 @@ def command(
     if sys.platform != "linux":
         raise SettingsError("dcon run needs Linux; dcon platform alone runs elsewhere too")
     from dcon.effective import warnings_of
+    from dcon.household.household import Household
     from dcon.link.notify import Notifier
     from dcon.settings import load
     from pmutools.timebase import NS, format_utc, parse_utc
