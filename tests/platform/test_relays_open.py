@@ -100,5 +100,5 @@ def test_a_trip_outlives_a_new_watchdog_and_an_operator_ends_it(
     assert "relays open; tripped; causes: " in shown(site, capsys) and " estop_software" in shown(site, capsys)
     site.activate()
     assert not latch.exists()
-    assert site.status()["watchdog"]["causes"] == [] and "\nrelays closed\n" in shown(site, capsys)
+    assert site.status()["watchdog"]["causes"] == [] and "\nrelays closed; beats in ms: control " in shown(site, capsys)
     assert site.end() == 130
