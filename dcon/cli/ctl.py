@@ -126,9 +126,18 @@ def _line(status: dict[str, Any]) -> str:
         return "no controller has been heard yet"
     flags = " ".join(dict.fromkeys(flag["name"] for flag in status["flags"] if flag["up"]))
     return (
-        f"{status['state']:<8} {status['mode']:<11} {status['active'] or '-':<10} "
+        f"{_old(status)}{status['state']:<8} {status['mode']:<11} {status['active'] or '-':<10} "
         f"{status['command_mw']:8.2f} MW {status['output_v']:7.3f} V  log {_lag(status)}  {flags}".rstrip()
     )
+
+
+def _old(status: dict[str, Any]) -> str:
+    """What goes before a state that nobody may take for the present one; "" for one that is present."""
+    return "" if status["controller_connected"] else f"OLD, by {_age(status['tick_age_ms'])}; last known: "
+
+
+def _age(age_ms: float | None) -> str:
+    return "nobody knows how much" if age_ms is None else f"{age_ms / 1000:.1f} s"
 
 
 def _lag(status: dict[str, Any]) -> str:
@@ -138,38 +147,41 @@ def _lag(status: dict[str, Any]) -> str:
 
 def relays_line(watchdog: dict[str, Any]) -> str:
     """What the watchdog says, and why."""
-    words = [f"relays {'closed' if watchdog['relays_closed'] else 'open'}"]
-    if watchdog["latched"]:
+    said = watchdog["last_said"]
+    words = [f"relays {'closed' if said['relays_closed'] else 'open'}"]
+    if said["latched"]:
         words.append("tripped")
-    causes = watchdog.get("causes")
-    if causes is None:
-        words.append("the watchdog is silent: this is old")
-    elif causes:
-        words.append(f"causes: {' '.join(causes)}")
+    if said["causes"]:
+        words.append(f"causes: {' '.join(said['causes'])}")
+    if watchdog["silent"]:
+        return f"relays NOT KNOWN: the watchdog is silent; {_age(watchdog['age_ms'])} ago it said: {'; '.join(words)}"
     if beats := [f"{name} {age:.0f}" for name, age in watchdog["beats_ms"].items() if age is not None]:
         words.append(f"beats in ms: {' '.join(beats)}")
     return "; ".join(words)
 
 
 def _text(status: dict[str, Any]) -> str:
+    watchdog = [] if status["watchdog"] is None else [relays_line(status["watchdog"])]
     if status.get("state") is None:
-        return _line(status)
-    log, watchdog = status["log"], status["watchdog"]
+        return "\n".join([_line(status), *watchdog])
+    log, is_old = status["log"], not status["controller_connected"]
+    was, last = ("was ", "last known: ") if is_old else ("", "")
     lines = [
-        f"{status['state']}, {status['mode']}, gain {status['gain_mw_per_mhz']:g} MW/mHz, "
+        f"{last}{status['state']}, {status['mode']}, gain {status['gain_mw_per_mhz']:g} MW/mHz, "
         f"instance {status['active'] or 'none'}",
-        f"command {status['command_mw']:.2f} MW, output {status['output_v']:.3f} V, probe {status['probe_mw']:.2f} MW",
+        f"{last}command {status['command_mw']:.2f} MW, output {status['output_v']:.3f} V, "
+        f"probe {status['probe_mw']:.2f} MW",
     ]
-    if not status["controller_connected"]:
-        lines.append("the controller is not connected: this is old")
-    if watchdog is not None:
-        lines.append(relays_line(watchdog))
+    if is_old:
+        age = _age(status["tick_age_ms"])
+        lines.insert(0, f"OLD, by {age}: the controller is silent; what it was doing when it was last heard:")
+    lines += watchdog
     for pmu in status["pmus"]:
         age, f = pmu["age_ms"], pmu["f_hz"]
-        shown = "nothing yet" if age is None else f"{age:.0f} ms old" + ("" if f is None else f", {f:.4f} Hz")
+        shown = "nothing yet" if age is None else f"{was}{age:.0f} ms old" + ("" if f is None else f", {f:.4f} Hz")
         lines.append(f"  {pmu['name']:<12} {shown}")
     for flag in status["flags"]:
-        state = "up" if flag["up"] else "latched"
+        state = f"{was}up" if flag["up"] else "latched"
         lines.append(f"  {state:<8} {flag['name']} {flag['subject']}: {flag['text']}")
     disk = "" if log["disk_free_percent"] is None else f", disk {log['disk_free_percent']:.0f} % free"
     lines.append(f"log {log['file'] or 'none'}, {_lag(status)}, {log['unlogged_ticks']} ticks missing{disk}")

@@ -19,6 +19,8 @@ from pmutools.cli.shell import Exit, Talk, common
 def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, quiet: bool, verbose: int) -> int:
     """Write one table of a session log to OUT: .csv, .parquet, .arrow or .jsonl.
 
+    `event` has what was ordered and what happened, `setting` the orders with who gave them and why.
+
     The first part of a session brings those that follow it; or name the parts.
 
     Exit code 3 says that part of the log is missing or could not be read.

@@ -6,7 +6,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,16 +77,30 @@ def command(
         household = Household(folder, commands, Notifier(), is_over)
         with household.stopped_by_signals():
             outcome = household.run()
-    summary: dict[str, Any] = json.loads(outcome.said) if outcome.said.strip() else {}
+    summary = _summary(outcome.said)
+    missing = summary.get("unlogged_ticks", 0)
     restarts = sum(outcome.restarts.values())
     if as_json:
         click.echo(json.dumps({**summary, "restarts": outcome.restarts}))
     if restarts:
         told = ", ".join(f"{name} {count} times" for name, count in outcome.restarts.items())
         talk.complain(f"started again: {told}")
+    if missing:
+        talk.complain(f"{missing} ticks are missing in the session log")
     if household.stopping:
         return Exit.INTERRUPTED
-    return Exit.INCOMPLETE if restarts and not outcome.code else outcome.code
+    return Exit.INCOMPLETE if (restarts or missing) and not outcome.code else outcome.code
+
+
+def _summary(said: Mapping[str, str]) -> dict[str, Any]:
+    """The controller's summary, with what the server knows of the log.
+
+    Both count ticks that are missing: the controller those that the server never confirmed, the server those that the
+    disk did not take and those that the controller could not keep for it. Some are both, so the larger number counts.
+    """
+    summary, log = (json.loads(said.get(name) or "{}") for name in ("platform", "server"))
+    missing = max(told.get("unlogged_ticks", 0) for told in (summary, log))
+    return {**summary, "unlogged_ticks": missing, "log_parts": log.get("log_parts", [])}
 
 
 def _commands(
@@ -99,7 +113,7 @@ def _commands(
 
     commands: dict[str, Callable[[], Sequence[str]]] = {
         "watchdog": lambda: alone("watchdog"),
-        "server": lambda: alone("server"),
+        "server": lambda: (*alone("server"), "--json"),
         "platform": lambda: (*alone("platform"), "--json", *timed()),
     }
     if settings.output.needs_process:

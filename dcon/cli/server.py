@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from types import FrameType
 
@@ -30,18 +31,22 @@ def command(ini: str, run_dir: str, log: str | None, as_json: bool, quiet: bool,
     settings = load(ini)
     if log is not None:
         settings = replace(settings, log=replace(settings.log, path=log))
-    server = Server(settings, run_dir, notifier=Notifier())
+    server = Server(settings, run_dir, notifier=Notifier(), begun=lambda path: talk.say(f"session log: {path}"))
 
     def stop(signum: int, frame: FrameType | None) -> None:
         server.stopping = True
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    talk.say(f"operators: {server.operators.address}; session log: {settings.log.path}")
+    talk.say(f"operators: {server.operators.address}; the session log begins with a controller's first tick")
     if settings.server.keys is None:
         talk.complain("no keys in [server]: nobody can order anything")
     server.run()
     report = server.report
+    if as_json:
+        click.echo(json.dumps({"log_parts": report.paths, "unlogged_ticks": report.unlogged}))
     if report.file:
-        talk.say(f"session log {report.file}, {report.parts} part(s), {report.unlogged} ticks are missing")
+        talk.say(f"session log {report.file}, {len(report.paths)} part(s), {report.unlogged} ticks are missing")
+    elif report.unlogged:
+        talk.complain(f"no session log: {report.unlogged} ticks are missing")
     return Exit.INCOMPLETE if report.unlogged else Exit.DONE

@@ -11,11 +11,15 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from dcon.core.values import Order, Pdci, Surroundings
-from dcon.link.beats import Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
+from dcon.link.beats import LoopName, Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
 from dcon.session.codec import Watchdog
 
 GPS_NS = 3_000_000_000
 """A lock that nobody has spoken of for so long is getting old."""
+HELPERS = (LoopName.UDP, LoopName.PARSE, LoopName.GPS, LoopName.GUI, LoopName.PDCI)
+"""Loops of the control process's children."""
+BEATING_MS = 250.0
+"""Those of an earlier life are older: a process is started again after so long, and takes its time."""
 SERVER_NS = 3_000_000_000
 """What the server has found out is not told any longer once it has been silent for so long."""
 
@@ -167,9 +171,13 @@ def is_healthy(heard: Heard, now_ns: int) -> bool:
 
 
 def is_there(heard: Heard, now_ns: int) -> bool:
-    """Whether there is nothing to wait for: the watchdog is healthy, or has tripped, which only an operator ends."""
-    tripped = heard.status is not None and heard.status.state is WatchdogState.TRIPPED
-    return is_healthy(heard, now_ns) or tripped
+    """Whether there is nothing to wait for: the watchdog is healthy, or has tripped, which only an operator ends, and
+    front and aides have beaten: they could start."""
+    status = heard.status
+    if status is None or status.state is not WatchdogState.TRIPPED:
+        return is_healthy(heard, now_ns)
+    beats_ms = dict(status.beats_ms)
+    return all(beats_ms.get(loop, math.inf) < BEATING_MS for loop in HELPERS)
 
 
 def _gps_age_s(heard: Heard, now_ns: int) -> float | None:

@@ -42,8 +42,13 @@ def acknowledged(flag: Flag, who: str) -> Flag:
 
 
 def latched(register: Register) -> list[str]:
-    """Names of checks that keep the controller from being armed."""
-    return sorted({flag.name for flag in register.values() if flag.latched})
+    """Names of checks that keep the controller from being armed until they are acknowledged."""
+    return sorted({flag.name for flag in register.values() if flag.latched and not flag.acknowledged})
+
+
+def still_up(register: Register) -> list[str]:
+    """Names of checks that do so although they are acknowledged: they have not fallen yet."""
+    return sorted({flag.name for flag in register.values() if flag.latched and flag.acknowledged})
 
 
 def open_flags(register: Register, text: str) -> list[Flag]:

@@ -22,7 +22,7 @@ from dcon.core.law import Transfer, approach, command_mw
 from dcon.core.orders import SYSTEM, Ordered, is_stop, moved, obey
 from dcon.core.params import Params
 from dcon.core.probe import IDLE
-from dcon.core.register import Register, latched, risen, with_changes
+from dcon.core.register import Register, latched, risen, still_up, with_changes
 from dcon.core.rows import CORE
 from dcon.core.state import Instance, Pmu, State
 from dcon.core.system import DRIVING, ArmView, Trigger
@@ -97,6 +97,7 @@ def _step(params: Params, state: State, inputs: Inputs, now_ns: int, supervisor:
             state.driven_mw,
             tuple(latched(flags)),
             tuple(supervisor.named(raised & (supervisor.tripping | supervisor.stopping))),
+            tuple(still_up(flags)),
         )
         for order in sorted(inputs.orders, key=is_stop):
             ordered = obey(params, ordered, order, arm, events)

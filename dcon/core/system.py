@@ -91,6 +91,8 @@ class ArmView(NamedTuple):
     """Checks that disarmed or tripped, and wait for an acknowledgement."""
     causes: tuple[str, ...] = ()
     """Checks that are up and would trip at once again."""
+    still_up: tuple[str, ...] = ()
+    """Checks that disarmed or tripped, are acknowledged, and have not fallen yet."""
 
 
 class Permissive(NamedTuple):
@@ -145,6 +147,10 @@ def _all_acknowledged(_params: Params, view: ArmView) -> bool:
     return not view.latched
 
 
+def _all_fallen(_params: Params, view: ArmView) -> bool:
+    return not view.still_up
+
+
 PERMISSIVES: Final = (
     Permissive("ready_instances", _enough_ready, "too few control instances are READY"),
     Permissive("command_small", _command_small, "the command is not small: wait for the swing to end"),
@@ -155,6 +161,7 @@ PERMISSIVES: Final = (
     Permissive("line_takes_it", _line_takes_it, "the line is out of service, or does not accept the command"),
     Permissive("line_has_room", _line_has_room, "the line's schedule leaves no room for the command"),
     Permissive("acknowledged", _all_acknowledged, "what disarmed or tripped last is not acknowledged"),
+    Permissive("fallen", _all_fallen, "what disarmed or tripped last is acknowledged, but still up"),
 )
 """All must hold to arm, and again to activate. What is not fitted allows, unless a setting requires it."""
 

@@ -1,12 +1,14 @@
 """``dcon run``: the processes of one controller, started in order, started again when they end, and ended in order.
 
-A process that is started again begins anew: the watchdog with open relays, the controller in INIT and open loop. So
-whatever dies, nothing is armed again but by an operator.
+What ends with an error before it was ever ready ends the whole. What ends later, or hangs and is killed, is started
+again and begins anew: the watchdog with open relays, the controller in INIT and open loop. So whatever dies, nothing is
+armed again but by an operator.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import select
 import signal
@@ -21,16 +23,15 @@ from types import FrameType
 from typing import NamedTuple
 
 from dcon.household.backoff import Backoff
+from dcon.household.ear import HUNG_S, Ear
 from dcon.link import paths
 from dcon.link.children import ending, launch
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from pmutools.errors import SourceError
 
 LOG = logging.getLogger(__name__)
-START_S = 20.0
-"""For a process to take its socket, on a busy machine."""
-LOOK_S = 0.02
-"""Between two looks at whether it has."""
+START_S = 30.0
+"""For a process to be ready, on a busy machine: the controller may wait 10 s for the watchdog."""
 ROUND_S = 1.0
 """The longest between two rounds: so often systemd is told that all is well."""
 USAGE = 2
@@ -40,7 +41,7 @@ DONE = (0, 3)
 
 
 class Member(NamedTuple):
-    """One process: when it may be called ready, and how long it may take to end."""
+    """One process, and how long it may take to end."""
 
     name: str
     inbox: str
@@ -53,6 +54,8 @@ WATCHDOG = Member("watchdog", paths.WATCHDOG)
 SERVER = Member("server", paths.SERVER, socket.SOCK_SEQPACKET, 15.0)
 OUTPUT = Member("output", paths.OUTPUT)
 PLATFORM = Member("platform", paths.CONTROL, patience_s=10.0)
+SPEAKERS = (SERVER, PLATFORM)
+"""Their standard output is kept: what they say of the run at its end."""
 STARTED = (WATCHDOG, SERVER, OUTPUT, PLATFORM)
 """In this order; who is not needed is left out."""
 ENDED = (PLATFORM, SERVER, WATCHDOG, OUTPUT)
@@ -66,18 +69,21 @@ class Outcome:
     code: int = 0
     """Exit code of the controller that was the last."""
     restarts: dict[str, int] = field(default_factory=dict)
-    said: str = ""
-    """What the last controller wrote to its standard output."""
+    said: dict[str, str] = field(default_factory=dict)
+    """What the last controller and the last server wrote to their standard output, by name."""
 
 
 @dataclass
 class _Running:
     member: Member
+    ear: Ear
     process: subprocess.Popen[str] | None = None
     pidfd: int = -1
     started_s: float = 0.0
-    again_s: float = 0.0
+    again_s: float = math.inf
     """When to start it again, where it does not run."""
+    was_ready: bool = False
+    """In this life or one before."""
     backoff: Backoff = field(default_factory=Backoff)
 
 
@@ -107,11 +113,13 @@ class Household:
         self.outcome = Outcome()
         self.stopping = False
         self._over = False
+        self._starting = True
         self._is_over = is_over
         self._commands = commands
         self._notifier = notifier or Notifier({})
-        self._running = {member.name: _Running(member) for member in STARTED if member.name in commands}
+        self._running: dict[str, _Running] = {}
         self._poll = select.poll()
+        self._round_s = time.monotonic()
         self._wake, self._woken = os.pipe()
         for fd in (self._wake, self._woken):
             os.set_blocking(fd, False)
@@ -128,18 +136,23 @@ class Household:
 
         Raises SourceError where a process cannot start, or one that runs already has its place.
         """
-        for each in self._running.values():
-            path = self.folder / each.member.inbox
-            if paths.is_held(path, each.member.kind):
+        needed = [member for member in STARTED if member.name in self._commands]
+        for member in needed:
+            path = self.folder / member.inbox
+            if paths.is_held(path, member.kind):
                 raise SourceError(
                     f"{path}: another process that is running has it; end that, or take another run folder"
                 )
         try:
-            for each in self._running.values():
+            for member in needed:
+                each = self._running[member.name] = _Running(member, Ear(self.folder, member.name))
+                each.ear.register(self._poll)
                 self._start(each)
-                if not self._became_ready(each):
-                    return self.outcome
-            self._notifier.tell(READY, status="running")
+                while not (each.was_ready or self.stopping or self._over):
+                    self._round()
+            self._starting = False
+            if not self.stopping and not self._over:
+                self._notifier.tell(READY, status="running")
             while not self.stopping and not self._over:
                 self._round()
         finally:
@@ -166,9 +179,10 @@ class Household:
 
     def _start(self, each: _Running) -> None:
         """Raises SourceError where the system has no room for one more."""
-        out = subprocess.PIPE if each.member is PLATFORM else subprocess.DEVNULL
-        environment = {key: value for key, value in os.environ.items() if key != "NOTIFY_SOCKET"}
+        out = subprocess.PIPE if each.member in SPEAKERS else subprocess.DEVNULL
+        environment = {**os.environ, "NOTIFY_SOCKET": each.ear.path}
         command = self._commands[each.member.name]()
+        each.ear.begin()
         each.started_s = time.monotonic()
         try:
             each.process = launch(command, dies_by=signal.SIGTERM, stdout=out, env=environment)
@@ -188,48 +202,61 @@ class Household:
             if process.stdout is not None:
                 process.stdout.close()
 
-    def _became_ready(self, each: _Running) -> bool:
-        """Wait until it has its socket; false where the end was asked for meanwhile."""
-        assert each.process is not None
-        end_s = time.monotonic() + START_S
-        path = self.folder / each.member.inbox
-        while not paths.is_held(path, each.member.kind) or each.process.poll() is not None:
-            if self.stopping:
-                return False
-            if each.process.poll() is not None:
-                self.outcome.code = each.process.returncode
-                raise SourceError(f"the {each.member.name} process could not start, {ending(each.process.returncode)}")
-            if time.monotonic() > end_s:
-                raise SourceError(f"the {each.member.name} process has not taken {path} in {START_S:g} s")
-            self._poll.poll(LOOK_S * 1000)
-        return not self.stopping
-
     # --- looking after
 
     def _round(self) -> None:
+        """Wait for news, at most ROUND_S, and see to everybody. Raises SourceError for one that cannot start."""
         now_s = time.monotonic()
         waiting = [each.again_s - now_s for each in self._running.values() if each.process is None]
         self._poll.poll(1000 * max(min([ROUND_S, *waiting]), 0.0))
         with suppress(BlockingIOError):
             os.read(self._wake, 4096)
+        last_s, self._round_s = self._round_s, time.monotonic()
+        passed_s = min(self._round_s - last_s, ROUND_S)  # where the whole machine stood still, nobody has hung
         for each in self._running.values():
-            if each.process is not None and each.process.poll() is not None:
-                self._bury(each)
-            elif each.process is None and time.monotonic() >= each.again_s and not self.stopping:
+            has_ended = each.process is not None and each.process.poll() is not None
+            each.ear.listen(passed_s)  # its last words too
+            each.was_ready = each.was_ready or each.ear.is_ready
+            if each.process is not None:
+                if has_ended:
+                    self._bury(each)
+                else:
+                    self._judge(each)
+            elif time.monotonic() >= each.again_s and not self.stopping:
                 try:
                     self._start(each)
                 except SourceError as error:
                     self._put_off(each, str(error))
+        if self._starting:
+            return
         missing = [name for name, each in self._running.items() if each.process is None]
         self._notifier.tell(ALIVE, status=f"waiting to restart {', '.join(missing)}" if missing else "running")
 
+    def _judge(self, each: _Running) -> None:
+        """Kill one that hangs; it is buried when it is dead, and nobody waits for that: a disk may hold it."""
+        ear, name = each.ear, each.member.name
+        limit_s = HUNG_S if ear.is_ready else START_S
+        if ear.silent_s <= limit_s:
+            return
+        if not each.was_ready:
+            raise SourceError(f"the {name} process is not ready after {START_S:g} s")
+        LOG.error("the %s process has not beaten for %g s, and is killed", name, limit_s)
+        assert each.process is not None
+        each.process.kill()
+        ear.silent_s = 0.0
+
     def _bury(self, each: _Running) -> None:
-        """It has ended: is that the end of the run, or when is it to be started again?"""
+        """It has ended: is that the end of the run, or when is it to be started again?
+
+        Raises SourceError where it never was ready: it would be the same again.
+        """
         code = self._close(each)
         if each.member is PLATFORM and (code in DONE or code == USAGE or self._is_over()):
             self._over = True
-            return
-        self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
+        elif not each.was_ready:
+            raise SourceError(f"the {each.member.name} process could not start, {ending(code)}")
+        else:
+            self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
 
     def _put_off(self, each: _Running, why: str) -> None:
         """It does not run: start it again, the later the more often that has happened."""
@@ -244,7 +271,7 @@ class Household:
         assert process is not None
         code = process.wait()
         if process.stdout is not None:
-            self.outcome.said = process.stdout.read()
+            self.outcome.said[each.member.name] = process.stdout.read()
             process.stdout.close()
         self._poll.unregister(each.pidfd)
         os.close(each.pidfd)
@@ -267,6 +294,7 @@ class Household:
                 if each.process is not None:
                     each.process.kill()
                     self._close(each)
+                each.ear.close()
             os.close(self._wake)
             os.close(self._woken)
 

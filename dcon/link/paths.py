@@ -15,9 +15,11 @@ WATCHDOG, CONTROL, AIDE, OUTPUT = "watchdog.in", "control.in", "aide.in", "outpu
 """Datagram sockets."""
 REPLIES = "server.replies"
 """Where the server hears what became of orders; datagrams."""
+STATUS = "status.in"
+"""Where the server hears the watchdog itself; datagrams."""
 SERVER = "server.in"
 """Sequenced packets: the server listens."""
-NAMES = (WATCHDOG, CONTROL, AIDE, OUTPUT, SERVER, REPLIES)
+NAMES = (WATCHDOG, CONTROL, AIDE, OUTPUT, SERVER, REPLIES, STATUS)
 LONGEST = 107
 """Bytes of a Unix socket's path."""
 

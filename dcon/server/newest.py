@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from dcon.core.rows import CORE
-from dcon.core.values import Event, Order
+from dcon.core.values import Event, InstanceState, Order
 from dcon.link.bundle import Bundle, Entry
+from dcon.server.told import shown
 from dcon.session import codec
 from dcon.session.head import Head
 from pmutools.schema.descriptors import message_class
@@ -21,6 +22,7 @@ EVENTS = 50
 MOST_FLAGS = 1000
 """Entries of the flag register that are kept."""
 TEXTS = {row.name: row.text for row in CORE.rows}
+WELL = (InstanceState.READY, InstanceState.HELD)
 SHOWN = frozenset(("Tick", "Instance", "Event", "Flag", "Setting", "Surroundings", "Pdci", "Watchdog", "Timing"))
 
 
@@ -73,11 +75,11 @@ class Newest:
                     news = news._replace(line=(message.time_ns, line if math.isfinite(line) else message.power_mw))
         return news._replace(orders=tuple(orders), events=tuple(events))
 
-    def status(self) -> dict[str, Any]:
-        """For operators; what is not known is None."""
+    def status(self, utc_ns: int, is_old: bool) -> dict[str, Any]:
+        """For operators at ``utc_ns``; what is not known is None. ``is_old``: no ticks come any more."""
         tick, told = self._last.get("Tick"), self._last.get("Surroundings")
         if tick is None:
-            return {"state": None, "flags": [], "instances": [], "pmus": [], "events": []}
+            return {"state": None, "flags": [], "instances": [], "pmus": [], "events": [], "watchdog": None}
         names, active = self.head.instances, tick.active
         return {
             "tick_ns": tick.tick_ns,
@@ -95,7 +97,7 @@ class Newest:
                 {"name": name, "age_ms": age, "f_hz": f}
                 for name, age, f in zip(self.head.pmus, tick.age_ms, tick.f_hz, strict=False)
             ],
-            "watchdog": self._watchdog(),
+            "watchdog": self._watchdog(utc_ns, is_old),
             "surroundings": None if told is None else _surroundings(told),
             "line": self._line(),
             "timing": self._timing(),
@@ -152,24 +154,27 @@ class Newest:
                 "active": active,
                 "delta_f_mhz": delta,
                 "command_mw": command,
-                "reason": reason,
+                "reason": "" if state in WELL else reason,  # it keeps why it was disabled last
             }
             for name, state, active, delta, command, reason in zip(self.head.instances, *columns, strict=False)
         ]
 
-    def _watchdog(self) -> dict[str, Any] | None:
+    def _watchdog(self, utc_ns: int, is_old: bool) -> dict[str, Any] | None:
+        """What the controller heard of it, which it logs each second and when it changes."""
         watchdog = self._last.get("Watchdog")
         if watchdog is None:
             return None
-        return {
-            "time_ns": watchdog.time_ns,
-            "relays_closed": watchdog.relays_closed,
-            "estop": watchdog.estop,
-            "latched": watchdog.latched,
-            "reason": watchdog.reason,
-            "causes": None if watchdog.silent else watchdog.reason.split(),
-            "beats_ms": dict(zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)),
-        }
+        return shown(
+            watchdog.silent or is_old,
+            source="log",
+            age_ms=max(utc_ns - watchdog.time_ns, 0) / 1e6,
+            time_ns=watchdog.time_ns,
+            relays_closed=watchdog.relays_closed,
+            estop=watchdog.estop,
+            latched=watchdog.latched,
+            causes=watchdog.reason.split(),
+            beats_ms=dict(zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)),
+        )
 
     def _line(self) -> dict[str, Any] | None:
         line = self._last.get("Pdci")

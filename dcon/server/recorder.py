@@ -24,9 +24,8 @@ LOG = logging.getLogger(__name__)
 class Report(NamedTuple):
     """How the log is."""
 
-    file: str = ""
-    """Of the part under way, or the last."""
-    parts: int = 0
+    paths: tuple[str, ...] = ()
+    """Of the session's parts; the last may be under way."""
     session: int | None = None
     have: int = -1
     """Last sequence that is safe: the process may be killed."""
@@ -39,6 +38,11 @@ class Report(NamedTuple):
     refused: bool = False
     """The system lets nothing be written at present."""
     disk_free_percent: float | None = None
+
+    @property
+    def file(self) -> str:
+        """The part under way, or the last."""
+        return self.paths[-1] if self.paths else ""
 
 
 class Recorder:
@@ -57,6 +61,7 @@ class Recorder:
         self._old = states.load(folder)
         self._assembly = Assembly()
         self._key = ""
+        self._unlogged_before = 0
         self._writer: RollingWriter | None = None
         self._whole = Place()
         """How far all that came is in the log, or counted."""
@@ -96,10 +101,9 @@ class Recorder:
                 self._said = self._said._replace(session=self._whole.session, have=self._whole.have)
                 self._safe_ns = self._tick_ns
             self._said = self._said._replace(
-                file=str(writer.parts[-1]) if writer.parts else "",
-                parts=len(writer.parts),
+                paths=tuple(map(str, writer.parts)),
                 tick_ns=self._safe_ns,
-                unlogged=writer.unlogged_ticks,
+                unlogged=self._unlogged(writer),
                 refused=writer.is_refused,
             )
         self._said = self._said._replace(gaps=self.gaps, disk_free_percent=free_percent(Path(self.path).parent))
@@ -114,7 +118,12 @@ class Recorder:
         configs = tuple((name, frame.hex(), at) for name, (frame, at) in self._configs.items())
         parts = tuple(map(str, writer.parts))
         session, have, ticks = self._whole
-        return State(session or 0, self._key, str(writer.path), have, parts, writer.size, configs, ticks)
+        lost = self._unlogged(writer), writer.missing, writer.reason
+        return State(session or 0, self._key, str(writer.path), have, parts, writer.size, configs, ticks, *lost)
+
+    def _unlogged(self, writer: RollingWriter) -> int:
+        """Ticks that are missing in the session, those of earlier lives of this process too."""
+        return self._unlogged_before + writer.unlogged_ticks
 
     def _head(self, pieces: Pieces) -> None:
         if self._writer is not None and pieces.session == self._assembly.place.session:
@@ -135,7 +144,7 @@ class Recorder:
 
     def _open(self, head: Head, state: State) -> None:
         """Write the log of a session, from its beginning or from where ``state`` says it is."""
-        self._key = state.key
+        self._key, self._unlogged_before = state.key, state.unlogged - state.untold
         self._configs = {name: (bytes.fromhex(frame), at) for name, frame, at in state.configs}
         self._whole = state.place
         self._assembly.begin(state.place)
@@ -146,6 +155,8 @@ class Recorder:
         )
         for name, (frame, at) in self._configs.items():
             self._writer.config(name, frame, at)
+        if state.untold:
+            self._writer.lost(state.untold, state.reason, 0)
 
     def _fresh(self, session: int) -> State:
         """A session of which nothing is there."""

@@ -26,6 +26,7 @@ from dcon.server.operators import Operators
 from dcon.server.recorder import Recorder, Report
 from dcon.server.response import LineResponse, Response
 from dcon.server.scribe import Scribe
+from dcon.server.told import WatchdogWord
 from dcon.session.head import Head, head_of
 from dcon.settings import Settings
 from pmutools.clock import Clock, SystemClock
@@ -37,6 +38,8 @@ NEWS_NS = NS // 2
 BREATH_NS = NS // 100
 SILENT_S = 2.0
 """A disk that holds the log up for longer makes the server silent to the controller: nothing is recorded."""
+FRESH_NS = NS // 2
+"""A controller whose newest tick is older is not connected, whatever its socket says."""
 CONNECTIONS = 8
 """Of controllers, at once: one is enough, but a new one may come before an old one is known to be gone."""
 BUNDLES_A_ROUND = 64
@@ -54,12 +57,15 @@ class Server:
         *,
         clock: Clock | None = None,
         notifier: Notifier | None = None,
+        begun: Callable[[str], object] = lambda path: None,
     ) -> None:
+        """``begun`` is called with the path of a session log once there is one."""
         self.settings = settings
         self.clock = clock or SystemClock()
         self.folder = paths.prepare(folder)
         self.stopping = False
         self._notifier = notifier or Notifier({})
+        self._begun = begun
         keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
         # it remembers no sequences of an earlier life: what was signed before this one is not told to the watchdog
         verifier = Verifier(keys, window_ns=round(settings.server.window_s * NS), floor_ns=self.clock.realtime_ns())
@@ -73,7 +79,10 @@ class Server:
         self._listener = paths.listen(self.folder, paths.SERVER)
         self._replies = paths.bind_datagram(self.folder, paths.REPLIES)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        patience_ns = round(settings.watchdog.status_timeout_ms * 1e6)
+        self._word = WatchdogWord(paths.bind_datagram(self.folder, paths.STATUS), patience_ns)
         self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
+        self._selector.register(self._word.sock, selectors.EVENT_READ, lambda _, now_ns, __: self._word.hear(now_ns))
         self._watchdog = Sender(self.folder / paths.WATCHDOG)
         self._control = Sender(self.folder / paths.CONTROL)
         self.desk = Desk(self.folder, self.status, verifier)
@@ -83,6 +92,9 @@ class Server:
         self._source: socket.socket | None = None
         """The connection whose session is being recorded."""
         self._lag_ns: int | None = None
+        """Of the newest tick when it came."""
+        self._looked_ns = 0
+        """When that was, monotonic."""
         self._found: Response | None = None
         self._beats = 0
         self._reports: deque[Report] = deque(maxlen=1)
@@ -125,15 +137,21 @@ class Server:
 
     def status(self) -> dict[str, Any]:
         """For operators."""
-        now_ns = self.clock.realtime_ns()
-        report = self.report
+        now_ns, monotonic_ns = self.clock.realtime_ns(), self.clock.monotonic_ns()
+        self._word.hear(monotonic_ns)
+        report, age_ns = self.report, self._tick_age_ns(monotonic_ns)
+        connected = self._source is not None and age_ns is not None and age_ns < FRESH_NS
+        controller = self.newest.status(now_ns, not connected)
+        word = self._word.told(monotonic_ns, now_ns)
         return {
             "time_ns": now_ns,
-            "controller_connected": self._source is not None,
-            **self.newest.status(),
+            "controller_connected": connected,
+            "tick_age_ms": None if age_ns is None else age_ns / 1e6,
+            **controller,
+            "watchdog": controller["watchdog"] if word is None else word,
             "log": {
                 "file": report.file,
-                "parts": report.parts,
+                "parts": len(report.paths),
                 "lag_s": (now_ns - report.tick_ns) / NS if report.tick_ns else None,
                 "waiting_bytes": self._scribe.waiting,
                 "gaps": report.gaps,
@@ -149,7 +167,7 @@ class Server:
                 "turned_away": self.operators.turned_away,
                 "orders_relayed": self.desk.relayed,
                 "orders_pending": len(self.desk.pending),
-                "malformed": self.malformed + self._assembly.malformed,
+                "malformed": self.malformed + self._assembly.malformed + self._word.malformed,
                 "failures": self.failures,
                 "undecodable": self.newest.undecodable,
             },
@@ -170,6 +188,7 @@ class Server:
         self._selector.close()
         paths.release(self._listener)
         paths.release(self._replies)
+        paths.release(self._word.sock)
 
     def _accept(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
         try:
@@ -246,16 +265,21 @@ class Server:
             self._assembly.begin(Place(pieces.session))
         if is_new or head != self.newest.head:
             self.newest = Newest(head)
+            self._lag_ns = None
             self.response = LineResponse()
 
     def _look(self, tick: Bundle, utc_ns: int) -> None:
         news = self.newest.take(tick)
-        self._lag_ns = utc_ns - tick.tick_ns
+        self._lag_ns, self._looked_ns = utc_ns - tick.tick_ns, self.clock.monotonic_ns()
         if news.driven_v is not None:
             self.response.command(tick.tick_ns, news.driven_v * MW_PER_V)
         if news.line is not None:
             self.response.line(*news.line)
         self.operators.answer(self.desk.heard(news))
+
+    def _tick_age_ns(self, monotonic_ns: int) -> int | None:
+        """How old the newest tick is: one that was kept for a server that was away was old when it came."""
+        return None if self._lag_ns is None else monotonic_ns - self._looked_ns + max(self._lag_ns, 0)
 
     def _reply(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
         try:
@@ -267,7 +291,10 @@ class Server:
     def _acknowledge(self) -> None:
         if not self._reports:
             return
-        self.report = report = self._reports.pop()
+        before, self.report = self.report, self._reports.pop()
+        report = self.report
+        if report.paths[:1] != before.paths[:1] and report.file:
+            self._begun(report.file)
         safe = (report.session, report.have)
         if safe != self._acked and report.session == self._assembly.place.session and self._source is not None:
             self._acked = safe
@@ -283,7 +310,8 @@ class Server:
     def _tell(self, now_ns: int) -> None:
         """News for the controller, none where the log hangs; and a status for who watches."""
         self._found = found = self.response.estimate()
-        if not self._hangs():
+        hangs = self._hangs()
+        if not hangs:
             news = {
                 "kind": "server",
                 "disk_free_percent": self.report.disk_free_percent,
@@ -291,5 +319,6 @@ class Server:
                 "response_lag_ms": None if found is None else found.lag_ms,
             }
             self._control.send(json.dumps(news).encode())
-            self._notifier.tell(ALIVE, status=f"{self.newest.ticks} ticks, {self.report.unlogged} missing")
+        trouble = "; the log hangs" if hangs else ""  # a new process would hang too, and serve nobody meanwhile
+        self._notifier.tell(ALIVE, status=f"{self.newest.ticks} ticks, {self.report.unlogged} missing{trouble}")
         self.operators.watched(to_json(self.status()) if self.operators.is_watched else b"", now_ns)

@@ -33,6 +33,12 @@ class State(NamedTuple):
     """PMU, configuration frame in hexadecimal, when it came."""
     ticks: int = 0
     """Of the session, up to ``have``."""
+    unlogged: int = 0
+    """Of those, the ones that are missing in the log."""
+    untold: int = 0
+    """Of these, the ones of which the log does not say so yet."""
+    reason: str = ""
+    """Why."""
 
     @property
     def place(self) -> Place:
@@ -46,8 +52,9 @@ def load(folder: Path) -> State | None:
         values = json.loads((folder / FILE).read_bytes())
         state = State(**values)
         configs = tuple((str(name), bytes.fromhex(frame).hex(), int(at)) for name, frame, at in state.configs)
-        numbers = (state.session, state.have, state.ticks, 0 if state.size is None else state.size)
-        texts = (state.key, state.path)
+        counts = (state.unlogged, state.untold, 0 if state.size is None else state.size)
+        numbers = (state.session, state.have, state.ticks, *counts)
+        texts = (state.key, state.path, state.reason)
         if not (all(type(number) is int for number in numbers) and all(isinstance(text, str) for text in texts)):
             return None
         return state._replace(parts=tuple(map(str, state.parts)), configs=configs)

@@ -84,9 +84,10 @@ class RollingWriter:
         """Ticks of the part; those of them that are not flushed yet."""
         self._tried_ns: int | None = None
         """When the system last refused to write; None once ticks are stored again."""
-        self._reason = ""
-        self._missing = 0
-        """Ticks that are not logged since the last that is."""
+        self.reason = ""
+        """Why ticks were not logged last."""
+        self.missing = 0
+        """Ticks that are not logged since the last that is: the log does not say so yet."""
         if not patient:
             self._open()
 
@@ -96,8 +97,8 @@ class RollingWriter:
         if log is None:
             self._count(1)
             return
-        if self._missing and not self._written:
-            gap = Event("log_gap", LOG_SUBJECT, f"{self._missing} ticks were not logged: {self._reason}")
+        if self.missing and not self._written:
+            gap = Event("log_gap", LOG_SUBJECT, f"{self.missing} ticks were not logged: {self.reason}")
             entries = (*entries, Entry("Event", "", codec.encode_event(tick_ns, gap), tick_ns, tick_ns))
         size = log.size
         try:
@@ -128,7 +129,7 @@ class RollingWriter:
         """``ticks`` will not come: what is logged next begins a part that says so."""
         if self._log is not None:
             self._end_part(self._log, now_ns)
-        self._reason = reason
+        self.reason = reason
         self._count(ticks)
 
     def flush(self, now_ns: int) -> None:
@@ -183,7 +184,7 @@ class RollingWriter:
 
     def _open(self) -> None:
         number = len(self.parts) + 1
-        head = {"part": str(number), "unlogged_ticks": str(self._missing)}
+        head = {"part": str(number), "unlogged_ticks": str(self.missing)}
         if self.parts:
             head |= {"continues": self.parts[-1].name, "first": self.parts[0].name}
         self.parts.append(part_path(self.path, number))
@@ -199,15 +200,15 @@ class RollingWriter:
         if not self._open_ticks:
             return
         if self._tried_ns is not None:
-            LOG.warning("%s: logging again; %d ticks are missing", self.parts[-1], self._missing)
+            LOG.warning("%s: logging again; %d ticks are missing", self.parts[-1], self.missing)
         self._tried_ns = None
-        self._missing = self._open_ticks = 0
+        self.missing = self._open_ticks = 0
 
     def _refused(self, error: SourceError, now_ns: int, ticks: int) -> None:
         """The system takes no more: go on without, and try again later. ``ticks`` are lost with the open chunk."""
         if self._tried_ns is None:
             LOG.error("%s; control goes on, and ticks that are not logged are counted", error)
-        self._reason = str(error).rpartition(": ")[2]
+        self.reason = str(error).rpartition(": ")[2]
         self._count(ticks)
         self._tried_ns = now_ns
         self._log = None
@@ -218,5 +219,5 @@ class RollingWriter:
                     path.unlink()
 
     def _count(self, ticks: int) -> None:
-        self._missing += ticks
+        self.missing += ticks
         self.unlogged_ticks += ticks

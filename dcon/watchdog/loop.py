@@ -54,12 +54,12 @@ class Watchdog:
         self._rules, self._lines = config.rules, config.lines
         self._output = links.output(config.output, config.folder)
         self._listeners = links.listeners(config.status, config.folder)
-        self._inbox = links.bind_inbox(config.folder)
-        self._path = os.path.join(config.folder, links.INBOX)
         try:
             self._report = Report(config.log, config.log_bytes)
         except OSError as error:
             raise links.Refused(f"{config.log}: {error.strerror}; name a log that can be written") from None
+        self._inbox = links.bind_inbox(config.folder)  # the last that may fail: who has it is the watchdog
+        self._path = os.path.join(config.folder, links.INBOX)
         latch = os.path.join(config.folder, NAME)
         latched = found(latch)
         self._latch, self._trouble = Latch(latch, latched), ""

@@ -26,6 +26,8 @@ from pmutools.timebase import NS
 GROWTH_MIB = 4.0
 """A process may grow by no more in the second half."""
 RATE_HZ = 60
+ASKED = 130
+"""Exit code of ``dcon run`` where it was asked to end."""
 LONGEST_S = 60.0
 """Between two disturbances."""
 
@@ -63,12 +65,13 @@ def soak(seconds: float) -> int:
         try:
             site.start("--json")
             site.activate()
-            looks = _disturbed(site, seconds, period_s)
+            looks, killed = _disturbed(site, seconds, period_s)
             site.caught_up()
             code = site.end()
         finally:
             site.close()
         done = _account(site)
+        restarts = site.summary()["restarts"]
         again = replay(str(site.log))
         logs = sorted(path.name for path in site.folder.glob("session*.mcap"))
     grown = {name: growth_mib(each) for name, each in looks.items()}
@@ -76,18 +79,25 @@ def soak(seconds: float) -> int:
           f"{done.unexplained} unexplained; in {', '.join(logs)}")  # fmt: skip
     print("memory of the second half: " + ", ".join(f"{name} {mib:+.1f} MiB" for name, mib in grown.items()))
     print(f"replay: {again.ticks} ticks, {again.different} different {again.stopped}".rstrip())
-    print(f"exit code {code}; the host took {steal_s() - before_s:.2f} s of processor time")
+    print(f"exit code {code}; started again: {restarts}; the host took {steal_s() - before_s:.2f} s of processor time")
     flat = all(mib < GROWTH_MIB for mib in grown.values())  # not a number is not flat
     replays = again.different == 0 and not again.stopped and again.ticks > 0
     whole = done.unexplained == 0 and done.due >= (seconds - 1) * RATE_HZ
-    return int(not (flat and replays and whole))
+    return int(not (flat and replays and whole and ended_well(code, restarts, killed)))
 
 
-def _disturbed(site: Running, seconds: float, period_s: float) -> dict[str, list[Look]]:
-    """Disturb it every ``period_s`` s; what each process had of memory, some forty times."""
+def ended_well(code: int, restarts: Mapping[str, int], killed: int) -> bool:
+    """It was asked to end, and does say so; nothing died or hung but the server, as often as it was killed."""
+    return code == ASKED and restarts == ({"server": killed} if killed else {})
+
+
+def _disturbed(site: Running, seconds: float, period_s: float) -> tuple[dict[str, list[Look]], int]:
+    """Disturb it every ``period_s`` s; what each process had of memory, some forty times, and how often one was
+    killed."""
     begun_s, kinds = time.monotonic(), cycle((_flooded, _stopped, _killed))
     looks: dict[str, list[Look]] = {name: [] for name in (*PROCESSES, "run")}
     look_s = disturb_s = 0.0
+    killed = 0
     while (passed_s := time.monotonic() - begun_s) < seconds:
         if passed_s >= disturb_s + period_s:
             disturb_s += period_s
@@ -95,6 +105,7 @@ def _disturbed(site: Running, seconds: float, period_s: float) -> dict[str, list
             if kind is _killed and passed_s > 0.45 * seconds:
                 kind = _flooded
             kind(site, period_s)
+            killed += kind is _killed
             state = site.status()["state"]
             site.activate()
             print(f"{passed_s:6.0f} s  {kind.__name__.strip('_')}: then {state}", flush=True)
@@ -104,7 +115,7 @@ def _disturbed(site: Running, seconds: float, period_s: float) -> dict[str, list
             if len(looks["run"]) % 4 == 1:
                 print(f"{passed_s:6.0f} s  {_told(looks)}", flush=True)
         time.sleep(0.05)
-    return looks
+    return looks, killed
 
 
 def _look(site: Running, looks: Mapping[str, list[Look]]) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 from bench.host import growth_mib
-from bench.running import account
+from bench.running import account, ended_well
 from bench.waking import Histogram, histogram, summed
 
 from dcon.session.codec import Timing
@@ -26,6 +26,21 @@ PRINTED = """# /dev/cpu_dma_latency set to 0us
 # Histogram Overflow at cycle number:
 # Thread 0: 00077
 """
+
+
+@pytest.mark.parametrize(
+    ("code", "restarts", "killed", "well"),
+    [
+        (130, {}, 0, True),
+        (130, {"server": 2}, 2, True),
+        (130, {"server": 3}, 2, False),
+        (130, {"server": 2, "platform": 1}, 2, False),
+        (130, {}, 1, False),
+        *((code, {}, 0, False) for code in (0, 1, 2, 3, -9)),  # 0 and 3 are those of a time that is over
+    ],
+)
+def test_how_a_long_run_must_end(code: int, restarts: dict[str, int], killed: int, well: bool) -> None:
+    assert ended_well(code, restarts, killed) is well
 
 
 def test_the_histogram_of_cyclictest() -> None:

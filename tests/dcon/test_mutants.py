@@ -496,6 +496,7 @@ ARMING = [
     *of(system._line_has_room, *((arm(pdci=STATUS._replace(power_mw=mw)), mw >= 435) for mw in (435.0, 435.5, 434.9))),
     *of(system._line_has_room, *lacking("pdci")),
     *of(system._all_acknowledged, (arm(), True), ((PARAMS, ARM._replace(latched=("gps",))), False)),
+    *of(system._all_fallen, (arm(), True), ((PARAMS, ARM._replace(still_up=("gps",))), False)),
     *of(
         system.refusal,
         ((PARAMS, SystemState.STANDBY, Trigger.ARM, ARM), ""),

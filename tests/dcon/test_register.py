@@ -9,7 +9,7 @@ import pytest
 from support.rig import Rig, Signal, steady
 from support.sessions import log_tick, open_session
 
-from dcon.core.register import NO_FLAGS, acknowledged, fallen, latched, open_flags, risen, with_changes
+from dcon.core.register import NO_FLAGS, acknowledged, fallen, latched, open_flags, risen, still_up, with_changes
 from dcon.core.values import Event, Flag, Order, Surroundings
 from dcon.session.reader import SessionReader
 
@@ -36,6 +36,8 @@ def test_a_latch_is_off_once_the_flag_is_down_and_seen(order: str) -> None:
     else:
         seen = acknowledged(flag, "Ada")
         assert seen.latched and not fallen(seen, T + 1).latched
+        assert still_up({("ringing", "system"): seen}) == ["ringing"]
+        assert latched({("ringing", "system"): seen}) == still_up({("ringing", "system"): flag}) == []
 
 
 def test_what_an_acknowledgement_means() -> None:
@@ -65,6 +67,19 @@ def test_a_check_that_disarmed_must_be_seen_before_the_next_arming() -> None:
     assert Event("ack", "system", "gps by Ada") in record.events
     assert rig.flag("gps").acknowledged == "Ada" and not rig.flag("gps").latched
     assert rig.tick(Order("arm", who="Ada")).events == (Event("armed", "system", "order by Ada"),)
+
+
+def test_what_is_acknowledged_and_still_up_is_refused_as_that() -> None:
+    sick = Surroundings(disk_free_percent=50.0, gps_age_s=9.0)
+    rig = Rig(steady()).arm().run(70)
+    rig.tick(told=sick)
+    rig.run(70, sick)
+    assert rig.records[-1].state == "STANDBY" and rig.flag("gps").up
+    assert "gps by Ada" in [event.detail for event in rig.tick(Order("ack", who="Ada"), told=sick).events]
+    (refused,) = [event.detail for event in rig.tick(Order("arm"), told=sick).events if event.name == "refused"]
+    assert "what disarmed or tripped last is acknowledged, but still up" in refused and "is not ack" not in refused
+    rig.run(5)
+    assert rig.tick(Order("arm")).state == "ARMED"
 
 
 def test_a_check_that_was_up_without_acting_needs_no_acknowledgement() -> None:

@@ -124,6 +124,7 @@ PERMITTED: dict[str, list[tuple[ArmView, bool]]] = {
     ],
     "line_has_room": [(told(WELL, pdci=LINE._replace(power_mw=mw)), mw == 435.0) for mw in (435.0, 434.0, 3200.0)],
     "acknowledged": [(WELL._replace(latched=("gps",)), False)],
+    "fallen": [(WELL._replace(still_up=("gps",)), False)],
 }
 
 

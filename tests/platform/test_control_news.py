@@ -10,9 +10,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from dcon.control.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, surroundings, watchdog_of
+from dcon.control.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, is_there, surroundings, watchdog_of
 from dcon.core.values import Order, Pdci, Surroundings
-from dcon.link.beats import Readback, WatchdogState, encode_readback
+from dcon.link.beats import UNHEARD, Readback, WatchdogState, encode_readback
 from dcon.session.codec import Watchdog, encode_order, encode_pdci, encode_surroundings
 from dcon.watchdog.codec import encode_status
 
@@ -43,6 +43,26 @@ def test_at_the_start_nothing_is_known_and_the_watchdog_is_not_healthy() -> None
 @pytest.mark.parametrize(("after_ns", "healthy"), [(0, True), (STATUS_NS, True), (STATUS_NS + 1, False)])
 def test_a_watchdog_is_healthy_for_100_ms_after_its_word(after_ns: int, healthy: bool) -> None:
     assert told((T0, status(T0)), at=T0 + after_ns).watchdog_healthy is healthy
+
+
+@pytest.mark.parametrize(
+    ("state", "ages_ms", "there"),
+    [
+        (WatchdogState.OPEN, (), True),
+        (WatchdogState.TRIPPED, (), False),
+        (WatchdogState.TRIPPED, (0, 20, 20, 100, 100, 249), True),
+        (WatchdogState.TRIPPED, (0, 20, 20, 100, 100, 250), False),
+        (WatchdogState.TRIPPED, (0, 20, 20, 100, 100, UNHEARD), False),
+        (WatchdogState.TRIPPED, (0, 2000, 20, 100, 100, 100), False),
+    ],
+)
+def test_the_first_tick_waits_for_all_that_may_not_start(
+    state: WatchdogState, ages_ms: tuple[int, ...], there: bool
+) -> None:
+    """A latched trip is no reason to begin before it is known that ports and places can be had."""
+    ages = (*ages_ms, *[UNHEARD] * (8 - len(ages_ms)))
+    news = heard((T0, encode_status(1, T0, 0, 7, state, state is WatchdogState.OPEN, 0, ages)))
+    assert is_there(news, T0 + MS) is there
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,12 @@ sock = socket.socket(socket.AF_UNIX, int(kind))
 sock.bind(path)
 if int(kind) == socket.SOCK_SEQPACKET: sock.listen(8)
 note("start")
-time.sleep(float(life))
+def tell(what): socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(what, os.environ["NOTIFY_SOCKET"])
+if deaf != "unready": tell(b"READY=1\\nWATCHDOG=1")
+end_s = time.monotonic() + float(life)
+while (rest_s := end_s - time.monotonic()) > 0:
+    if deaf == "-": tell(b"WATCHDOG=1")
+    time.sleep(min(0.05, rest_s))
 print('{"ticks": 7}')
 note("over"); sys.exit(int(code))
 """
@@ -58,6 +63,8 @@ class House:
         """(seconds, exit code) of each life, by name; the last goes on."""
         self.deaf = ""
         """Who does not end when asked to."""
+        self.unready = ""
+        """Who never says that it is ready."""
         names = [member.name for member in STARTED if output or member.name != "output"]
         self.household = Household(self.folder, {name: self.command(name) for name in names})
 
@@ -68,7 +75,8 @@ class House:
             lives = self.lives.get(name, [(60.0, 0)])
             life_s, code = lives.pop(0) if len(lives) > 1 else lives[0]
             words = (self.folder / member.inbox, int(member.kind), self.log, name, life_s, code)
-            return ["-c", STAND_IN, *map(str, words), "deaf" if name == self.deaf else "-"]
+            how = "deaf" if name == self.deaf else "unready" if name == self.unready else "-"
+            return ["-c", STAND_IN, *map(str, words), how]
 
         return made
 
@@ -113,7 +121,7 @@ def test_a_controller_whose_time_is_over_ends_the_run_with_its_code_and_its_word
     house = House(tmp_path)
     house.lives["platform"] = [(0.3, 3)]
     outcome = house.household.run()
-    assert (outcome.code, outcome.restarts, outcome.said) == (3, {}, '{"ticks": 7}\n')
+    assert (outcome.code, outcome.restarts, outcome.said["platform"]) == (3, {}, '{"ticks": 7}\n')
     assert house.events("term") == ["server", "watchdog"]
     assert house.is_empty()
 
@@ -183,6 +191,49 @@ def test_one_that_cannot_start_ends_the_others_in_one_line(tmp_path: Path) -> No
     assert house.events("start") == ["watchdog"] and house.is_empty()
 
 
+@pytest.mark.parametrize("name", ["watchdog", "server", "output", "platform"])
+def test_one_that_ends_before_it_was_ever_ready_ends_the_whole(name: str, tmp_path: Path) -> None:
+    """A socket is not enough: what fails may fail after that."""
+    house = House(tmp_path, output=True)
+    house.unready = name
+    house.lives[name] = [(0.3, 1)]
+    with pytest.raises(SourceError, match=rf"^the {name} process could not start, exit code 1$"):
+        house.household.run()
+    assert house.events("start").count(name) == 1 and house.is_empty()
+
+
+def test_one_that_is_never_ready_is_not_waited_for_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(household, "START_S", 0.5)
+    house = House(tmp_path)
+    house.unready = "server"
+    with pytest.raises(SourceError, match=r"^the server process is not ready after 0.5 s$"):
+        house.household.run()
+    assert house.events("start") == ["watchdog", "server"] and house.is_empty()
+
+
+@pytest.mark.parametrize("name", ["watchdog", "server", "platform"])
+def test_what_hangs_is_killed_and_started_again(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(household, "HUNG_S", 1.0)
+    house = House(tmp_path)
+    stopped: list[int] = []
+
+    def again() -> bool:
+        lines = [line.split() for line in house.log.read_text().splitlines() if line.startswith("start ")]
+        if not stopped and len(lines) == 3:
+            stopped.extend(int(pid) for _, who, pid, _ in lines if who == name)
+            os.kill(stopped[0], signal.SIGSTOP)
+        return len(lines) == 4
+
+    house.stop_when(again)
+    outcome = house.household.run()
+    assert outcome.restarts == {name: 1}
+    assert f"the {name} process has not beaten for 1 s, and is killed" in caplog.text
+    assert f"the {name} process has ended, by SIGKILL; started again in 0.25 s" in caplog.text
+    assert house.is_empty()
+
+
 def test_a_second_run_in_one_folder_is_refused_and_disturbs_nobody(tmp_path: Path) -> None:
     house = House(tmp_path)
     with bind_datagram(house.folder, CONTROL), pytest.raises(SourceError, match=r"control.in: another process that is"):
@@ -193,8 +244,8 @@ def test_a_second_run_in_one_folder_is_refused_and_disturbs_nobody(tmp_path: Pat
 def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     house = House(tmp_path)
     house.deaf = "server"
-    for name, each in house.household._running.items():
-        house.household._running[name].member = each.member._replace(patience_s=0.3)
+    brief = tuple(member._replace(patience_s=0.3) for member in STARTED)
+    monkeypatch.setattr(household, "STARTED", brief)
     house.stop_when(lambda: len(house.events("start")) == 3)
     house.household.run()
     assert house.events("term") == ["watchdog"] or house.events("term") == ["platform", "watchdog"]

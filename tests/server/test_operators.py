@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import socket
 import threading
 import time
@@ -18,8 +19,9 @@ from support.operated import FakePlatform
 from support.shipped import ServerProcess, eventually
 
 from dcon.cli import dcon
-from dcon.cli.ctl import relays_line
+from dcon.cli.ctl import _line, relays_line
 from dcon.link import paths
+from dcon.link.beats import CAUSES as CAUSE_BITS
 from dcon.link.keys import add_key, read_keys
 from dcon.link.orders import REPLAYED, SignedOrder, sign
 from dcon.link.paths import bind_datagram, prepare
@@ -28,8 +30,10 @@ from dcon.server import operators
 from dcon.server.client import Client, order
 from dcon.session.codec import Watchdog
 from dcon.session.reader import SessionReader
+from dcon.watchdog.codec import encode_status
 from pmutools.cli.shell import run
 from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.timebase import NS
 
 pytestmark = pytest.mark.realtime
 Ctl = Callable[..., int]
@@ -170,6 +174,7 @@ def test_status_has_everything(site: Site) -> None:
     assert status["log"]["file"].endswith("session.mcap") and status["log"]["unlogged_ticks"] == 0
 
 
+SILENT = "relays NOT KNOWN: the watchdog is silent"
 CAUSES: list[tuple[Watchdog, list[str] | None, str]] = [
     (Watchdog(1, True), [], "relays closed"),
     (Watchdog(2, True, reason="server"), ["server"], "relays closed; causes: server"),
@@ -178,7 +183,11 @@ CAUSES: list[tuple[Watchdog, list[str] | None, str]] = [
         ["control", "estop_software"],
         "relays open; tripped; causes: control estop_software",
     ),
-    (Watchdog(4, True, silent=True), None, "relays closed; the watchdog is silent: this is old"),
+    (
+        Watchdog(4, True, silent=True),
+        None,
+        "relays NOT KNOWN: the watchdog is silent; 4.0 s ago it said: relays closed",
+    ),
 ]
 
 
@@ -187,7 +196,48 @@ def test_what_the_watchdog_says_and_why(site: Site) -> None:
         site.platform.control.watchdog = watchdog
         site.until(lambda at=watchdog.time_ns: (site.status()["watchdog"] or {}).get("time_ns") == at)
         said = site.status()["watchdog"]
-        assert said["causes"] == causes and relays_line(said) == line
+        assert said["source"] == "log" and said["age_ms"] > 1e6
+        assert said["causes"] == causes and relays_line({**said, "age_ms": 4000.0}) == line
+
+
+def test_a_controller_that_hangs_is_told_in_the_first_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its socket is open still: what counts is whether ticks come."""
+    site.until(lambda: site.status()["controller_connected"])
+    assert site.status()["tick_age_ms"] < 500
+    assert site.ctl("status", who=None) == 0
+    assert "OLD" not in capsys.readouterr().out
+    site.platform.hangs.set()
+    try:
+        site.until(lambda: (site.status()["tick_age_ms"] or 0) > 1100)
+        assert site.status()["controller_connected"] is False and site.status()["state"] is not None
+        assert site.ctl("status", who=None) == 0
+        first, second, third, *_ = capsys.readouterr().out.splitlines()
+        assert re.match(r"OLD, by [12]\.\d s: the controller is silent", first)
+        assert second.startswith("last known: ") and third.startswith("last known: command ")
+        assert _line(site.status()).startswith("OLD, by ")
+        assert site.status()["watchdog"]["relays_closed"] is None and site.status()["watchdog"]["silent"]
+    finally:
+        site.platform.hangs.clear()
+    site.until(lambda: site.status()["controller_connected"])
+
+
+def test_the_watchdog_s_own_word_counts_and_ages(site: Site) -> None:
+    """Whatever the control log says of it: here that the relays are closed."""
+    site.platform.control.watchdog = Watchdog(5, True)
+    word = paths.Sender(site.run_dir / paths.STATUS)
+    word.send(b"nonsense")
+    word.send(encode_status(1, time.monotonic_ns() + 3600 * NS, 0, 7, 2, False, 1 << CAUSE_BITS.index("control")))
+    said = site.status()["watchdog"]
+    assert (said["source"], said["relays_closed"], said["latched"], said["estop"]) == ("watchdog", False, True, False)
+    assert said["causes"] == ["control"] and 0 <= said["age_ms"] <= 100 and not said["silent"]
+    assert relays_line(said).startswith("relays open; tripped; causes: control")
+    site.until(lambda: site.status()["watchdog"]["silent"])  # one from the future ages too
+    said = site.status()["watchdog"]
+    assert said["age_ms"] > 100 and said["source"] == "watchdog"
+    assert said["relays_closed"] is said["latched"] is said["estop"] is said["causes"] is None
+    assert relays_line(said).startswith(SILENT) and relays_line(said).endswith("relays open; tripped; causes: control")
+    assert site.status()["server"]["malformed"] == 1
+    word.close()
 
 
 def test_watch_comes_twice_a_second(site: Site) -> None:
@@ -348,6 +398,9 @@ def test_a_client_that_does_not_read_is_known_by_what_waits() -> None:
 
 
 def test_the_log_tells_of_orders_and_refusals(site: Site) -> None:
+    assert site.ctl("ack", "frozen N1") == 0
+    with Client(site.where) as client:
+        client.ask({"signed": site.signed("Ben", name="estop")})
     tick_ns = site.status()["tick_ns"]
     site.until(lambda: site.status()["log"]["lag_s"] < (time.time_ns() - tick_ns) / 1e9)
     orders = [order for tick in SessionReader(site.server.log).ticks() for order in tick.orders]

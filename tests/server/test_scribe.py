@@ -15,8 +15,10 @@ import pytest
 from support.disk import full_disk
 from support.shipped import INI, FakeControl, eventually, free_port, recorder_in, same_ticks, tick_at
 
+from dcon.household.ear import Ear
 from dcon.link import paths
 from dcon.link.bundle import Bundle, Kind, decode
+from dcon.link.notify import Notifier
 from dcon.link.paths import bind_datagram, prepare
 from dcon.sections import Log
 from dcon.server import scribe, server
@@ -86,7 +88,9 @@ def test_operators_are_served_while_the_disk_hangs(
     folder = prepare(tmp_path / "run")
     control_in = bind_datagram(folder, paths.CONTROL)
     settings = parse(f"{INI}[server]\nlisten = 127.0.0.1:{free_port()}\n", "test")
-    made = Server(replace(settings, log=Log(path=str(tmp_path / "session.mcap"))), folder)
+    ear = Ear(folder, "server")
+    log = Log(path=str(tmp_path / "session.mcap"))
+    made = Server(replace(settings, log=log), folder, notifier=Notifier({"NOTIFY_SOCKET": ear.path}))
     thread = threading.Thread(target=made.run)
     thread.start()
     control = FakeControl(folder)
@@ -105,7 +109,10 @@ def test_operators_are_served_while_the_disk_hangs(
         with suppress(BlockingIOError):
             while True:
                 control_in.recv(4096)
+        ear.listen(0.0)
         time.sleep(1.1)
+        ear.listen(1.1)
+        assert ear.silent_s == 0.0  # who looks after it does not kill it: operators are served
         with pytest.raises(BlockingIOError):  # the controller is told by silence: nothing is recorded
             control_in.recv(4096)
         stuck.set()
@@ -116,6 +123,7 @@ def test_operators_are_served_while_the_disk_hangs(
         made.stopping = True
         thread.join()
         control_in.close()
+        ear.close()
     same_ticks(SessionReader(tmp_path / "session.mcap"), range(50))
 
 

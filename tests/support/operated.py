@@ -17,12 +17,15 @@ from dcon.link.paths import bind_datagram
 
 
 class FakePlatform:
-    """Runs in a thread at 200 ticks/s. ``activate`` is refused, everything else is obeyed; ``deaf`` hears nothing."""
+    """Runs in a thread at 200 ticks/s. ``activate`` is refused, everything else is obeyed; ``deaf`` hears nothing, and
+    while ``hangs`` is set there are no ticks, and all sockets stay open."""
 
     def __init__(self, folder: Path, keys: Path, deaf: bool = False) -> None:
         self.control = FakeControl(folder)
+        self.control.begun_ns = time.time_ns()
         self.aide = bind_datagram(folder, paths.AIDE)
         self.deaf = deaf
+        self.hangs = threading.Event()
         self.verifier = Verifier(read_keys(keys))
         self.refusals = RefusalLog()
         self.taken: list[Order] = []
@@ -38,6 +41,9 @@ class FakePlatform:
 
     def _run(self) -> None:
         while not self._ended.is_set():
+            if self.hangs.is_set():
+                time.sleep(0.005)
+                continue
             orders = [] if self.deaf else self._heard()
             events = [
                 Event("refused", order.name, f"not in STANDBY; order by {order.who}")

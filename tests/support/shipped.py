@@ -31,10 +31,10 @@ side = south
 TICKS = [tick._replace(record=tick.record._replace(events=())) for tick in random_ticks(300)]
 
 
-def tick_at(number: int) -> Tick:
-    """Any number of ticks, from those that were made."""
+def tick_at(number: int, begun_ns: int = T0) -> Tick:
+    """Any number of ticks, from those that were made; POSIX UTC of the first."""
     tick = TICKS[number % len(TICKS)]
-    tick_ns = T0 + number * PERIOD_NS
+    tick_ns = begun_ns + number * PERIOD_NS
     frames = tuple(frame._replace(tick_ns=tick_ns) for frame in tick.frames)
     return tick._replace(record=tick.record._replace(tick_ns=tick_ns), frames=frames, pdci=None)
 
@@ -46,6 +46,8 @@ class FakeControl:
         self.shipper = Shipper(session, HEAD.pieces(session), Ring(600 * NS, 64 << 20) if ring is None else ring)
         self.shipping = Shipping(folder / SERVER, self.shipper)
         self.ticks = 0
+        self.begun_ns = T0
+        """POSIX UTC of the first tick."""
         self.watchdog: Watchdog | None = None
         """Logged with each tick, where there is one."""
         for name, frame in CONFIGS.items():
@@ -53,7 +55,7 @@ class FakeControl:
 
     def tick(self, orders: tuple[Order, ...] = (), events: tuple[Event, ...] = ()) -> None:
         """Make and ship the next tick, and serve the connection, as a control process does."""
-        tick = tick_at(self.ticks)
+        tick = tick_at(self.ticks, self.begun_ns)
         record = tick.record._replace(events=events)
         given = orders or tick.orders
         entries = tick_entries(
