@@ -21,6 +21,7 @@ from dcon.watchdog.latch import NAME
 from pmutools.cli.shell import run
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's"),

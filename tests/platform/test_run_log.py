@@ -12,6 +12,7 @@ from support.running import Running
 from dcon.session.reader import SessionReader
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's"),

@@ -13,6 +13,7 @@ from dcon.cli import dcon
 from pmutools.cli.shell import run
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.slow,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run is Linux's"),
