@@ -35,6 +35,9 @@ from pmutools.flow import Chunk, Flow, Train, host_of
 HELD_BYTES = 4 << 20
 ALL_HELD_BYTES = 64 << 20
 FRAGMENT_BYTES = 1 << 20
+"""A CFG-3 in several frames may be so long."""
+ALL_FRAGMENT_BYTES = 16 << 20
+"""Of all that are not complete; beyond it those begun first are given up."""
 FLOWS = 1 << 16
 """Flows remembered at once; when another comes (a flood of spoofed sources), one is ended that has long been silent."""
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
@@ -124,7 +127,6 @@ class _FlowState:
         self.borrowed: set[int] = set()
         """IDCODEs whose configuration another flow has shown."""
         self.held: dict[int, _Held] = {}
-        self.fragments: dict[int, tuple[int, bytearray]] = {}
         self.proven = False
         self.early: list[Skipped] = []
         self.early_bytes = 0
@@ -165,6 +167,9 @@ class Demux:
         self.put_on_hold: list[int] = []
         """IDCODEs of the data frames that the last :meth:`feed` has put on hold."""
         self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
+        self._fragments: dict[tuple[Flow, int], tuple[int, bytearray]] = {}
+        """Of each CFG-3 that is not complete: the next CONT_IDX, and what there is; the longest untouched first."""
+        self._fragment_bytes = 0
 
     def feed(self, chunk: Chunk) -> list[Message | Loss]:
         """Messages and losses that this chunk completes."""
@@ -468,7 +473,9 @@ class Demux:
         prefix = decode_prefix(frame.data)
         index = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + 2], "big")
         part = frame.data[PREFIX_SIZE + 2 : -CHK_SIZE]
-        expected, body = state.fragments.pop(prefix.idcode, (FIRST_FRAGMENT, bytearray()))
+        key = state.flow, prefix.idcode
+        expected, body = self._fragments.pop(key, (FIRST_FRAGMENT, bytearray()))
+        self._fragment_bytes -= len(body)
         if index == FIRST_FRAGMENT:
             expected, body = FIRST_FRAGMENT, bytearray()
         last = index == LAST_FRAGMENT
@@ -476,7 +483,11 @@ class Demux:
             return None
         body += part
         if not last:
-            state.fragments[prefix.idcode] = (index + 1, body)
+            self._fragments[key] = (index + 1, body)
+            self._fragment_bytes += len(body)
+            while self._fragment_bytes > ALL_FRAGMENT_BYTES or len(self._fragments) > FLOWS:
+                _, given_up = self._fragments.pop(next(iter(self._fragments)))
+                self._fragment_bytes -= len(given_up)
             return None
         return decode_config_body(prefix, b"\0\0" + bytes(body))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from pmutools.c37118.config import StreamConfig, encode_config
+from pmutools.c37118.config import StreamConfig, encode_config, frames_in
 from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.frames import decode_command, encode_command, encode_header, restamp
@@ -323,12 +323,19 @@ class Served:
 
     def announcements(self, now_ns: int) -> list[bytes]:
         """The configurations to send unasked, stamped with UTC ``now_ns``."""
-        return [frame for kind in self.announced if (frame := self.frame(kind, now_ns)) is not None]
+        told = (self.frame(kind, now_ns) for kind in self.announced)
+        return [part for frame in told if frame is not None for part in frames_in(frame)]
 
     def frame(self, kind: FrameType, now_ns: int) -> bytes | None:
-        """The answer of this kind, stamped with its time of transmission (clause 6.2.2), UTC ``now_ns``."""
+        """The answer of this kind, stamped with its time of transmission (clause 6.2.2), UTC ``now_ns``.
+
+        Of a CFG-3 in several frames all of them, end to end.
+        """
         frame = self.frames.get(kind)
-        return None if frame is None else restamp(frame, *from_ns(now_ns, self.time_base))
+        if frame is None:
+            return None
+        stamp = from_ns(now_ns, self.time_base)
+        return b"".join(restamp(part, *stamp) for part in frames_in(frame))
 
 
 def served(config: StreamConfig, header: str = "") -> Served:

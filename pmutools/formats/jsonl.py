@@ -126,6 +126,8 @@ class _Reader:
                 self._defects["compression damaged"] = 1
 
     def _configure(self, item: Json, kind: FrameType) -> Iterator[Block]:
+        if item.get("undecodable") and kind is FrameType.CFG3:
+            return  # a fragment; the last one has the whole
         try:
             config = config_of(item, kind)
         except _MISFITS:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from pmutools import linux
 from pmutools.c37118.checksum import chk
+from pmutools.c37118.config import frames_in
 from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.framer import Frame, Framer
 from pmutools.c37118.session import Outcome, Served, ServerRole
@@ -199,7 +200,10 @@ class Outlet:
         elif answer.outcome is Outcome.STOPPED:
             self.stage.audience.stop(self.handles[answer.idcode], client.key, client)
         self._tell(answer.outcome, client.address, idcode=answer.idcode, code=answer.code, extended=answer.extended)
-        return () if answer.frame is None else self.stage.treat(self.handles[answer.idcode], answer.frame)
+        if answer.frame is None:
+            return ()
+        treat, handle = self.stage.treat, self.handles[answer.idcode]
+        return [treated for part in frames_in(answer.frame) for treated in treat(handle, part)]
 
     def _forget(self, client: _Client) -> None:
         for idcode in client.role.started:

@@ -12,6 +12,8 @@ from pmutools.c37118 import Demux, FrameType, Message, StreamConfig, decode_conf
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import PhasorChannel, frames_in
 from pmutools.c37118.constants import PREFIX_SIZE
+from pmutools.c37118.demux import ALL_FRAGMENT_BYTES
+from pmutools.c37118.session import Served
 from pmutools.errors import EncodeError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.formats import open_sink, open_source
@@ -91,3 +93,26 @@ def test_every_format_keeps_it(suffix: str, tmp_path: Path) -> None:
     assert {len(batch.config.stations[0].phasors) for batch in batches} == {300}
     if suffix != "csv":  # which has no place for it
         assert {batch.config for batch in batches} == {config}
+
+
+def test_fragments_that_never_end_take_so_much_memory_and_no_more() -> None:
+    demux = Demux()
+    wanted = frames_in(encode_config(long_config()))
+    many = frames_in(encode_config(replace(long_config(4000))))[:-1]
+    for port in range(40):  # each nearly a megabyte
+        flow = Flow("udp", f"192.0.2.9:{5000 + port}", "192.0.2.2:4713")
+        for part in many:
+            demux.feed(Chunk(part, 1, flow, StampSource.KERNEL))
+        assert demux._fragment_bytes == sum(len(body) for _, body in demux._fragments.values()) <= ALL_FRAGMENT_BYTES
+    assert demux._fragment_bytes > ALL_FRAGMENT_BYTES / 2
+    found = [item for part in wanted for item in demux.feed(Chunk(part, 1, FLOW, StampSource.KERNEL))]
+    assert isinstance(found[-1], Message) and found[-1].config == long_config()
+
+
+def test_who_serves_it_stamps_each_of_its_frames() -> None:
+    config = long_config()
+    offer = Served(config.idcode, config.time_base, {FrameType.CFG3: encode_config(config)}, (FrameType.CFG3,))
+    parts = offer.announcements(1_700_000_000 * 10**9)
+    assert len(parts) == 2 and b"".join(parts) == offer.frame(FrameType.CFG3, 1_700_000_000 * 10**9)
+    prefix, found = decode_config(b"".join(parts))
+    assert found == config and prefix.soc == 1_700_000_000
