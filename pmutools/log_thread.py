@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import logging
 import queue
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from logging.handlers import QueueHandler
 from threading import Thread
 
 ROOM = 256
 """Lines that wait to be written at most."""
+Aside = Callable[[Callable[[], object]], None]
+"""Has something else done by the thread, in its turn; dropped where there is no room."""
 END_S = 1.0
 """What is left is given so long in the end."""
 
 
-class _Aside(QueueHandler):
+_Lines = queue.Queue[logging.LogRecord | Callable[[], object] | None]
+
+
+class _Handler(QueueHandler):
     """Hands lines over. What finds no room is dropped, and the next line that does says how many were."""
 
-    def __init__(self, lines: queue.Queue[logging.LogRecord | None]) -> None:
+    def __init__(self, lines: _Lines) -> None:
         super().__init__(lines)
         self.dropped = 0
 
@@ -33,18 +38,23 @@ class _Aside(QueueHandler):
 
 
 @contextmanager
-def log_in_thread() -> Iterator[None]:
+def log_in_thread() -> Iterator[Aside]:
     """Whatever is logged within goes to the root logger's handlers by a thread, :data:`ROOM` lines behind at most.
 
     Begin it before the thread that must not wait is given a real-time policy: threads inherit that.
     """
-    root, lines = logging.getLogger(), queue.Queue[logging.LogRecord | None](ROOM)
+    root, lines = logging.getLogger(), _Lines(ROOM)
     handlers = root.handlers[:]
     thread = Thread(target=_write, args=(lines, handlers), name="log", daemon=True)
     thread.start()
-    root.handlers[:] = [_Aside(lines)]
+    root.handlers[:] = [_Handler(lines)]
+
+    def aside(work: Callable[[], object]) -> None:
+        with suppress(queue.Full):
+            lines.put_nowait(work)
+
     try:
-        yield
+        yield aside
     finally:
         root.handlers[:] = handlers
         try:
@@ -54,8 +64,11 @@ def log_in_thread() -> Iterator[None]:
         thread.join(END_S)
 
 
-def _write(lines: queue.Queue[logging.LogRecord | None], handlers: list[logging.Handler]) -> None:
-    while (record := lines.get()) is not None:
+def _write(lines: _Lines, handlers: list[logging.Handler]) -> None:
+    while (line := lines.get()) is not None:
+        if not isinstance(line, logging.LogRecord):
+            line()
+            continue
         for handler in handlers:
-            if record.levelno >= handler.level:
-                handler.handle(record)
+            if line.levelno >= handler.level:
+                handler.handle(line)

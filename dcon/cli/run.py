@@ -49,6 +49,7 @@ def command(
     from dcon.household.household import Household
     from dcon.link.notify import Notifier
     from dcon.settings import load
+    from pmutools.log_thread import log_in_thread
     from pmutools.timebase import NS, format_utc, parse_utc
 
     talk = Talk(quiet, verbose)
@@ -75,7 +76,7 @@ def command(
     with _folder(run_dir or settings.platform.run_dir) as folder:
         commands = _commands(settings, ini, folder, flags, timed)
         household = Household(folder, commands, Notifier(), is_over)
-        with household.stopped_by_signals():
+        with household.stopped_by_signals(), log_in_thread():  # who looks after others waits for no reader of stderr
             outcome = household.run()
     summary = _summary(outcome.said)
     missing = summary.get("unlogged_ticks", 0)

@@ -26,22 +26,28 @@ def command(ini: str, run_dir: str, log: str | None, as_json: bool, quiet: bool,
     from dcon.link.notify import Notifier
     from dcon.server.server import Server
     from dcon.settings import load
+    from pmutools.log_thread import log_in_thread
 
     talk = Talk(quiet, verbose)
     settings = load(ini)
     if log is not None:
         settings = replace(settings, log=replace(settings.log, path=log))
-    server = Server(settings, run_dir, notifier=Notifier(), begun=lambda path: talk.say(f"session log: {path}"))
+    with log_in_thread() as aside:  # a stuck reader of stderr must hold up neither operators nor the log
 
-    def stop(signum: int, frame: FrameType | None) -> None:
-        server.stopping = True
+        def say(text: str) -> None:
+            aside(lambda: talk.say(text))
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    talk.say(f"operators: {server.operators.address}; the session log begins with a controller's first tick")
-    if settings.server.keys is None:
-        talk.complain("no keys in [server]: nobody can order anything")
-    server.run()
+        server = Server(settings, run_dir, notifier=Notifier(), begun=lambda path: say(f"session log: {path}"))
+
+        def stop(signum: int, frame: FrameType | None) -> None:
+            server.stopping = True
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        say(f"operators: {server.operators.address}; the session log begins with a controller's first tick")
+        if settings.server.keys is None:
+            aside(lambda: talk.complain("no keys in [server]: nobody can order anything"))
+        server.run()
     report = server.report
     if as_json:
         click.echo(json.dumps({"log_parts": report.paths, "unlogged_ticks": report.unlogged}))

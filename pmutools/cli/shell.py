@@ -92,19 +92,27 @@ class Talk:
     def complain(self, text: str) -> None:
         """Say what went wrong: shown with ``--quiet`` too."""
         self._clear()
-        click.echo(visible(text), err=True)
+        _echo(visible(text))
 
     def progress(self, text: str) -> None:
         """A line that the next one overwrites, and an empty one removes; only where a person is watching."""
         if not self.quiet and sys.stderr.isatty():
             self._clear()
-            click.echo(visible(text), err=True, nl=False)
+            _echo(visible(text), nl=False)
             self._shown = bool(text)
 
     def _clear(self) -> None:
         if self._shown:
-            click.echo("\r\x1b[K", err=True, nl=False)
+            _echo("\r\x1b[K", nl=False)
             self._shown = False
+
+
+def _echo(text: str, *, nl: bool = True) -> None:
+    """To stderr. Where whoever read it is gone, the work goes on: only without stdout it would be for nothing."""
+    try:
+        click.echo(text, err=True, nl=nl)
+    except BrokenPipeError:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4, of the same name before
