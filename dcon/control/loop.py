@@ -266,9 +266,13 @@ class Platform:
         if known == config:
             return
         if (problem := engine.reconfigure(name, config)) is not None:
-            if known is None and engine.state.system is SystemState.INIT:
-                raise SettingsError(problem)
             self._unusable[name] += 1
+            if (
+                known is None
+                and engine.state.system is SystemState.INIT
+                and len(self._unusable) == len(engine.params.pmus)
+            ):
+                raise SettingsError(problem)  # not one can be used: it is the settings that are wrong
             LOG.log(logging.WARNING if self._unusable[name] <= TOLD else logging.INFO, "%s", problem)
         self._configs.append((name, frame.data, frame.arrival_ns or 0))
 

@@ -251,7 +251,8 @@ class Household:
         Raises SourceError where it never was ready: it would be the same again.
         """
         code = self._close(each)
-        if each.member is PLATFORM and (code in DONE or code == USAGE or self._is_over()):
+        is_mistake = code == USAGE and PLATFORM.name not in self.outcome.restarts  # one that has run does not end all
+        if each.member is PLATFORM and (code in DONE or self._is_over() or is_mistake):
             self._over = True
         elif not each.was_ready:
             raise SourceError(f"the {each.member.name} process could not start, {ending(code)}")

@@ -121,11 +121,22 @@ def at_50(name: str) -> StreamConfig:
     return Streams((name,), rate=50).streams[name].config
 
 
-def test_a_first_configuration_that_cannot_be_used_ends_the_start(bench: Make) -> None:
-    made = bench([config_chunk("N1", START_NS, at_50("N1"))])
-    with pytest.raises(SettingsError, match="PMU N1: its stream 101 sends 50 frames/s, the controller runs at 60; set"):
+def test_first_configurations_of_which_none_can_be_used_end_the_start(bench: Make) -> None:
+    made = bench([config_chunk(name, START_NS, at_50(name)) for name in STREAMS.configs])
+    with pytest.raises(
+        SettingsError, match=r"PMU ..: its stream \d+ sends 50 frames/s, the controller runs at 60; set"
+    ):
         made.run(3)
     assert made.driver.sent[-1][1] == 0.0 and made.driver.closed
+
+
+def test_a_first_configuration_that_cannot_be_used_costs_the_others_nothing(
+    bench: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = bench([config_chunk("N2", START_NS, at_50("N2")), *stream(4, ("N1", "S1"))])
+    summary = made.run(3)
+    assert "PMU N2: its stream 102 sends 50 frames/s" in caplog.text
+    assert summary.final_state == "STANDBY"
 
 
 def test_once_an_instance_is_ready_a_wrong_stream_costs_no_control(

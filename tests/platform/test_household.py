@@ -146,6 +146,14 @@ def test_a_controller_that_was_set_up_wrongly_is_not_started_again(tmp_path: Pat
     assert house.events("start") == ["watchdog", "server", "platform"]
 
 
+def test_one_that_has_run_is_started_again_whatever_it_ends_with(tmp_path: Path) -> None:
+    """What a stream says meanwhile is no mistake in the initialisation file."""
+    house = House(tmp_path)
+    house.lives["platform"] = [(0.3, 1), (0.3, 2)]
+    house.stop_when(lambda: house.events("start").count("platform") >= 3)
+    assert house.household.run().restarts == {"platform": 2}
+
+
 @pytest.mark.parametrize("call", ["fork", "pidfd"])
 def test_a_system_without_room_for_a_process_is_asked_again_later(
     call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
