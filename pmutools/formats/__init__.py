@@ -256,8 +256,10 @@ def _open_folder(path: Path, configs: Iterable[StreamConfig], nominal: Nominal) 
 
     known = tuple(configs)
     files = sorted(file for file in path.iterdir() if file.is_file() and _by_suffix(file) and not _is_second(file))
-    if any(file.suffix == JOURNAL for file in files):  # it has what unfinished files have
-        files = [file for file in files if not _is_unfinished(file)]
+    journals = [file for file in files if file.suffix == JOURNAL]
+    if journals:  # they have what unfinished files have; that of the folder's own recording has finished ones too
+        whole = {Path(file.stem).suffix for file in journals if Path(file.stem).stem == path.name}
+        files = [file for file in files if file.suffix not in whole and not _is_unfinished(file)]
     if not files:
         raise SourceError(f"{path} is a folder without recordings; name a file, or a folder of {known_suffixes()}")
     sources = [open_source(file, configs=known, data_rate=nominal.data_rate, fnom_hz=nominal.fnom_hz) for file in files]

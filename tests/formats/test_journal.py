@@ -124,6 +124,22 @@ def test_a_finished_table_beside_an_unfinished_one_is_read_too(tmp_path: Path) -
     assert sorted({item.frame.idcode for item in open_source(place).items() if isinstance(item, Message)}) == [7, 8]
 
 
+def test_frames_of_tables_that_a_full_disk_let_finish_are_not_read_twice(tmp_path: Path) -> None:
+    """Closing has failed at a later table: the journal stays, with the frames of all."""
+    messages = stream(7) + stream(8)
+    place = tmp_path / "live"
+    place.mkdir()
+    with open_sink(place / "log.parquet", journal=True, per_stream=True) as sink:
+        for block in blocks(messages):
+            sink.write(block)
+        sink.flush()
+        (journal,) = place.rglob("*.journal")
+        kept = journal.read_bytes()
+    journal.write_bytes(kept)
+    sink.paths[-1].unlink()
+    assert sorted(frames_in(journal.parent)) == sorted(data_of(messages))
+
+
 def test_other_arrow_streams_are_no_journals(tmp_path: Path) -> None:
     import pyarrow as pa
 
