@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -80,14 +80,17 @@ class LiveShow:
         if self._clock is not None:
             yield self._clock.quality.short
         if self._out is not None:
-            yield f"{self._out.name} {sum(map(_size, self._paths())) / 1e6:.1f} MB"
+            yield f"{self._out.name} {_size(self._paths()) / 1e6:.1f} MB"
         yield from self._more()
 
 
-def _size(path: Path) -> int:
-    """Of a recording, with the journal that holds what an unfinished table does not yet."""
+def _size(paths: Iterable[Path]) -> int:
+    """Of a recording, with its journal, which holds what unfinished tables do not yet: beside one, in their folder."""
+    files: set[Path] = set()
+    for path in paths:
+        files |= {path, path.with_name(path.name + JOURNAL), path.with_name(path.parent.name + path.suffix + JOURNAL)}
     size = 0
-    for each in (path, path.with_name(path.name + JOURNAL)):
+    for file in files:
         with suppress(OSError):  # not there yet, or not any more
-            size += each.stat().st_size
+            size += file.stat().st_size
     return size
