@@ -9,6 +9,7 @@ so a client lives on time-outs.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from pmutools.c37118.config import StreamConfig, encode_config, frames_in
 from pmutools.c37118.config_kinds import as_kind
 from pmutools.c37118.constants import Command, FrameType
 from pmutools.c37118.frames import decode_command, encode_command, encode_header, restamp
-from pmutools.errors import WireError
+from pmutools.errors import EncodeError, WireError
 from pmutools.timebase import NS, from_ns
 
 # --- client ------------------------------------------------------------------------------------------------------
@@ -341,12 +342,13 @@ class Served:
 def served(config: StreamConfig, header: str = "") -> Served:
     """What a device that sends ``config``'s data answers: CFG-1, 2 and 3, and a header if there is a text.
 
-    Unasked it sends CFG-2, and CFG-3 after it where the data need that: CFG-2 cannot say all that CFG-3 says.
+    Unasked it sends CFG-2, and CFG-3 after it where the data need that: CFG-2 cannot say all that CFG-3 says. A kind
+    that has no room for so many channels is not on offer. Raises EncodeError where ``config`` itself is no frame.
     """
-    frames = {
-        kind: encode_config(config if config.kind is kind else as_kind(config, kind))
-        for kind in (FrameType.CFG1, FrameType.CFG2, FrameType.CFG3)
-    }
+    frames = {config.kind: encode_config(config)}
+    for kind in (FrameType.CFG1, FrameType.CFG2, FrameType.CFG3):
+        with suppress(EncodeError):
+            frames.setdefault(kind, encode_config(config if config.kind is kind else as_kind(config, kind)))
     if header:
         frames[FrameType.HEADER] = encode_header(config.idcode, header)
     announced = (FrameType.CFG2, FrameType.CFG3) if config.kind is FrameType.CFG3 else (FrameType.CFG2,)

@@ -13,7 +13,7 @@ from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import PhasorChannel, frames_in
 from pmutools.c37118.constants import PREFIX_SIZE
 from pmutools.c37118.demux import ALL_FRAGMENT_BYTES
-from pmutools.c37118.session import Served
+from pmutools.c37118.session import Served, served
 from pmutools.errors import EncodeError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
 from pmutools.formats import open_sink, open_source
@@ -116,3 +116,13 @@ def test_who_serves_it_stamps_each_of_its_frames() -> None:
     assert len(parts) == 2 and b"".join(parts) == offer.frame(FrameType.CFG3, 1_700_000_000 * 10**9)
     prefix, found = decode_config(b"".join(parts))
     assert found == config and prefix.soc == 1_700_000_000
+
+
+def test_what_cfg_2_has_no_room_for_is_served_as_cfg_3() -> None:
+    config = long_config()
+    stations = tuple(
+        replace(station, phasors=tuple(PhasorChannel(f"V{n}") for n in range(4000))) for station in config.stations
+    )
+    offer = served(replace(config, stations=stations))
+    assert set(offer.frames) == {FrameType.CFG3}
+    assert decode_config(b"".join(offer.announcements(0)))[1].stations[0].phasors[-1].name == "V3999"
