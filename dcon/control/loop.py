@@ -267,11 +267,8 @@ class Platform:
             return
         if (problem := engine.reconfigure(name, config)) is not None:
             self._unusable[name] += 1
-            if (
-                known is None
-                and engine.state.system is SystemState.INIT
-                and len(self._unusable) == len(engine.params.pmus)
-            ):
+            none = not engine.bindings and len(self._unusable) == len(engine.params.pmus)
+            if none and known is None and engine.state.system is SystemState.INIT:
                 raise SettingsError(problem)  # not one can be used: it is the settings that are wrong
             LOG.log(logging.WARNING if self._unusable[name] <= TOLD else logging.INFO, "%s", problem)
         self._configs.append((name, frame.data, frame.arrival_ns or 0))
