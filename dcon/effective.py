@@ -11,7 +11,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any, Final, NamedTuple
 
 from dcon.core.idle import idle_checks
-from dcon.redundancy import single_safeguards
+from dcon.safeguards import weak_safeguards
 from dcon.settings import ELSEWHERE, PARAMS, RATE_HZ, Settings, every_pair
 
 GIVEN: Final = "initialisation file"
@@ -35,8 +35,8 @@ NOT_SET: Final = "not set"
 
 
 def warnings_of(settings: Settings) -> list[str]:
-    """One line for each check that cannot fire, and each safeguard that one failure defeats."""
-    return idle_checks(settings.params) + single_safeguards(settings)
+    """One line for each check that cannot fire, and each safeguard that does not do all that it could."""
+    return idle_checks(settings.params) + weak_safeguards(settings)
 
 
 class Effective(NamedTuple):

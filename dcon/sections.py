@@ -50,6 +50,8 @@ class LineInput:
     url: LineSource | None = field(default=None, metadata=parsed_by(line_source))
     """``udp://ADDRESS:PORT?source=...``, where its datagrams are awaited, or ``modbus://HOST:PORT?...``, a device to be
     asked (see the page on outputs); without it the status is not known."""
+    required: bool = field(default=True, metadata=parsed_by(boolean))
+    """The line's status must be known: without it no arming, and a loss disarms."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dcon.core.params import RATES, Line, Pair, Params, PmuParams, Required
 from dcon.core.probe import Probing
 from dcon.core.thresholds import Thresholds
 from dcon.limiter import LIMIT_MW
-from dcon.redundancy import check_redundancy, is_same_file
+from dcon.safeguards import check_safeguards, is_same_file
 from dcon.sections import LineInput, Log, Output, Platform, Server, Watchdog
 from pmutools.errors import SettingsError
 from pmutools.parsers import Parser, boolean, choice, integer, number, suggestion, words
@@ -66,7 +66,7 @@ def load(path: str | Path) -> Settings:
     settings = from_ini(ini, text)
     _spared(settings, ini, path)
     try:
-        check_redundancy(settings)
+        check_safeguards(settings)
     except Clash as clash:
         raise _placed(clash, ini, "watchdog") from None
     most = settings.params.gain_max_mw_per_mhz
@@ -118,7 +118,8 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
     sites = sites_of(ini)
     platform = fill(Platform, ini.section("platform"))
     watchdog, server = fill(Watchdog, ini.section("watchdog")), fill(Server, ini.section("server"))
-    required = Required(platform.gps_required, watchdog.required, server.required)
+    line_input = fill(LineInput, _split(ini.section("pdci"), LineInput)[0])
+    required = Required(platform.gps_required, watchdog.required, server.required, line_input.required)
     probing, probe_file = probing_of(ini.section("probing"), probe_file)
     try:
         params = _params(ini, sites, required, probing)
@@ -137,7 +138,7 @@ def from_ini(ini: Ini, text: str = "", probe_file: bytes | None = None) -> Setti
         fill(Log, ini.section("log")),
         text,
         probe_file,
-        line_input=fill(LineInput, _split(ini.section("pdci"), LineInput)[0]),
+        line_input=line_input,
         given=frozenset((section.name, key) for section in ini.sections for key in section.entries),
     )
 

@@ -31,7 +31,7 @@ LAYERS = [
     ["dcon.core", "dcon.places"],
     ["dcon.link"],
     ["dcon.watchdog"],
-    ["dcon.sections", "dcon.frontend", "dcon.redundancy"],
+    ["dcon.sections", "dcon.frontend", "dcon.safeguards"],
     ["dcon.settings"],
     ["dcon.effective", "dcon.engine"],
     ["dcon.session"],

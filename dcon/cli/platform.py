@@ -67,6 +67,9 @@ def command(
     except ValueError as error:
         raise SettingsError(f"--start: {error}") from None
     folder = run_dir or settings.platform.run_dir
+    required = settings.params.required._asdict() if folder is None else {}
+    if untold := ", ".join(name for name, is_required in required.items() if is_required):
+        talk.say(f"warning: alone, nobody tells what is required ({untold}), so nothing can be armed")
     if folder is not None and log is not None:
         raise SettingsError("--log: with a run folder the server writes the log; set [log] path for it")
     notifier = Notifier()

@@ -43,8 +43,6 @@ class PmuParams:
 class Line:
     """The DC line that the command is added to: ``[pdci]``."""
 
-    required: bool = False
-    """Status of the line must be known: without it no arming, and a loss disarms."""
     rating_ns_mw: float = setting(3220.0, "MW", "path rating, north to south", 0, 1e5)
     """Largest power north to south."""
     rating_sn_mw: float = setting(3100.0, "MW", "path rating, south to north", 0, 1e5)
@@ -59,13 +57,13 @@ class Line:
         check_order(self, [("minimum_mw", key) for key in ("rating_ns_mw", "rating_sn_mw") if getattr(self, key) > 0])
 
 
-@dataclass(frozen=True, slots=True)
-class Required:
+class Required(NamedTuple):
     """Sources of :class:`~dcon.core.values.Surroundings` that must be there: without them no arming, a loss acts."""
 
     gps: bool = False
     watchdog: bool = False
     server: bool = False
+    line: bool = False
 
 
 class Pair(NamedTuple):
@@ -174,7 +172,7 @@ class Params:
     @cached_property
     def requires(self) -> bool:
         """Whether any source of the surroundings must be there."""
-        return self.line.required or self.required != Required()
+        return self.required != Required()
 
     @cached_property
     def bands(self) -> Bands:

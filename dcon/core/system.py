@@ -135,12 +135,12 @@ def _server_there(params: Params, view: ArmView) -> bool:
 
 def _line_takes_it(params: Params, view: ArmView) -> bool:
     status = line_status(params, view.surroundings, view.now_ns)
-    return not params.line.required if status is None else status.in_service and status.dcon_enabled
+    return not params.required.line if status is None else status.in_service and status.dcon_enabled
 
 
 def _line_has_room(params: Params, view: ArmView) -> bool:
     status = line_status(params, view.surroundings, view.now_ns)
-    return not params.line.required if status is None else margin_mw(params, status, view.driven_mw) >= 0
+    return not params.required.line if status is None else margin_mw(params, status, view.driven_mw) >= 0
 
 
 def _all_acknowledged(_params: Params, view: ArmView) -> bool:

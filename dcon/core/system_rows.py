@@ -109,13 +109,13 @@ def disk(_params: Params, view: SystemView) -> float | None:
 def line_in_service(params: Params, view: SystemView) -> float | None:
     """1 where the line is in service."""
     status = line_status(params, view.surroundings, view.now_ns)
-    return _told(None if status is None else float(status.in_service), params.line.required)
+    return _told(None if status is None else float(status.in_service), params.required.line)
 
 
 def line_enabled(params: Params, view: SystemView) -> float | None:
     """1 where the line accepts the command."""
     status = line_status(params, view.surroundings, view.now_ns)
-    return _told(None if status is None else float(status.dcon_enabled), params.line.required)
+    return _told(None if status is None else float(status.dcon_enabled), params.required.line)
 
 
 def line_margin(params: Params, view: SystemView) -> float | None:

@@ -141,6 +141,7 @@ def perform(demo: Demo, tell: Callable[[str, float], None] = lambda text, second
                     deadband_mhz=0.0,
                     init_s=demo.course.init_s,
                     urls=[f"udp://127.0.0.1:{site.pmu_port + number}" for number in range(len(pmus))],
+                    pdci=f"url = udp://127.0.0.1:{site.status_port}" if WHOLE else "required = no",
                     extra=_extra(demo, site),
                 )
             )
@@ -158,7 +159,6 @@ def _extra(demo: Demo, site: Site) -> str:
         return output
     return output + "\n".join(
         (
-            f"[pdci]\nurl = udp://127.0.0.1:{site.status_port}",
             f"[watchdog]\nrequired = yes\nlog = {site.work / 'watchdog.jsonl'}\n{PATIENT}",
             f"[server]\nrequired = yes\nlisten = 127.0.0.1:{site.server_port}\nkeys = {site.keys}",
             f"[log]\npath = {demo.log_path.absolute()}",

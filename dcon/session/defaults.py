@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 KEY = "defaults"
 """Of a log's metadata: the number of the defaults in force; 1 where a log has none."""
-NUMBER = 2
+NUMBER = 3
 """Of those in force now."""
-CHANGED = ((2, "pdci.status_age_s=10"),)
+CHANGED = ((2, "pdci.status_age_s=10"), (3, "pdci.required=no"))
 """(number of the defaults that brought another, what held before)."""
 
 

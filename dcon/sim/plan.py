@@ -76,9 +76,13 @@ def ini_of(
     align: bool = True,
     interpolate_single_loss: bool = False,
     init_s: float = 20.0,
+    pdci: str = "required = no",
     extra: str = "",
 ) -> str:
-    """The initialisation file of a controller fed by emulated PMUs."""
+    """The initialisation file of a controller fed by emulated PMUs.
+
+    ``pdci`` is what it says of the line, whose status they do not tell.
+    """
     sections = [f"[DEFAULT]\nrate = {rate_hz}\nvoltage = VA,VB,VC\nnominal_kv = {pmus[0].nominal_kv:g}\n"]
     for number, pmu in enumerate(pmus):
         url = urls[number] if urls else f"udp://127.0.0.1:{FIRST_PORT + number}"
@@ -93,4 +97,5 @@ def ini_of(
     ]
     if gain_mw_per_mhz > 15:
         law.append(f"gain_max_mw_per_mhz = {gain_mw_per_mhz!r}")
-    return "\n".join([*sections, "\n".join(law) + "\n"]) + extra
+    line = ["[pdci]", pdci]
+    return "\n".join([*sections, "\n".join(law) + "\n", "\n".join(line) + "\n"]) + extra

@@ -115,6 +115,19 @@ def test_exit_codes_and_no_traceback(
         assert out == "" and err.startswith("dcon: ") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(("pdci", "warns"), [("", True), ("required = no", False)])
+def test_a_platform_alone_says_what_nobody_tells_it(
+    pdci: str, warns: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dcon.control.loop.prepare", lambda *, fifo: None)
+    urls = ["udp://127.0.0.1:0?source=127.0.0.1", "udp://127.0.0.1:0"]
+    Path("dcon.ini").write_text(Streams(("N1", "S1")).ini(urls=urls, pdci=pdci))
+    assert run(dcon(), ["platform", "--ini", "dcon.ini", "--log", "no/such/folder.mcap"]) == 1, "it ends at once"
+    err = capsys.readouterr().err
+    assert err.startswith("warning: alone, nobody tells what is required (line), so nothing can be armed\n") == warns
+
+
 def test_an_error_that_nobody_expected_is_one_line_too(
     session: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:

@@ -372,7 +372,7 @@ SHORT = [
 
 # --- the whole controller ----------------------------------------------------------------------------------------
 
-STRICT = replace(PARAMS, required=Required(True, True, True), line=Line(required=True))
+STRICT = replace(PARAMS, required=Required(True, True, True, True))
 STATUS = Pdci(T, 1500.0)
 OLD = STATUS._replace(time_ns=T - 2_000_000_000)
 OLDER = STATUS._replace(time_ns=T - 2_000_000_001)
@@ -392,7 +392,7 @@ def scheduled(mw: float, power_mw: float = 1500.0, params: Params = PARAMS) -> t
 
 
 def rated(north_south: float, south_north: float) -> Params:
-    return replace(PARAMS, line=Line(False, north_south, south_north, 0.0))
+    return replace(PARAMS, line=Line(north_south, south_north, 0.0))
 
 
 def remembered(**changed: Any) -> tuple[Params, SystemView]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from support.rig import STEADY, Rig, Signal, constant, steady
@@ -495,16 +496,21 @@ def test_late_ticks_trip_nothing_that_is_not_armed() -> None:
     assert rig.records[-1].state == "STANDBY" and rig.up == {"overrun"}
 
 
-REQUIRED: dict[str, tuple[str, tuple[str, ...], Surroundings, str]] = {
-    "[platform]\ngps_required = yes": ("disarm", ("gps",), Surroundings(gps_age_s=0.0), "has no GPS lock"),
-    "[watchdog]\nrequired = yes": (
+REQUIRED: dict[tuple[str, str], tuple[str, tuple[str, ...], Surroundings, str]] = {
+    ("extra", "[platform]\ngps_required = yes"): ("disarm", ("gps",), Surroundings(gps_age_s=0.0), "has no GPS lock"),
+    ("extra", "[watchdog]\nrequired = yes"): (
         "trip",
         ("watchdog", "estop"),
         Surroundings(watchdog_healthy=True, estop_released=True),
         "the watchdog is not healthy; the emergency stop is pressed",
     ),
-    "[server]\nrequired = yes": ("warn", ("server",), Surroundings(server_age_s=0.1), "the server is silent"),
-    "[pdci]\nrequired = yes": (
+    ("extra", "[server]\nrequired = yes"): (
+        "warn",
+        ("server",),
+        Surroundings(server_age_s=0.1),
+        "the server is silent",
+    ),
+    ("pdci", ""): (
         "disarm",
         ("line_out", "line_refuses"),
         Surroundings(pdci=STATUS),
@@ -513,18 +519,19 @@ REQUIRED: dict[str, tuple[str, tuple[str, ...], Surroundings, str]] = {
 }
 
 
-@pytest.mark.parametrize("extra", REQUIRED)
-def test_what_is_required_must_be_there(extra: str) -> None:
-    """Nothing is armed without it, and losing it acts."""
-    kind, names, there, refused = REQUIRED[extra]
-    rig = Rig(steady(), extra=extra)
+@pytest.mark.parametrize("said", REQUIRED)
+def test_what_is_required_must_be_there(said: tuple[str, str]) -> None:
+    """Nothing is armed without it, and losing it acts; of the line that is so unless the settings say otherwise."""
+    kind, names, there, refused = REQUIRED[said]
+    settings: dict[str, Any] = dict([said])
+    rig = Rig(steady(), **settings)
     for _ in range(12):
         rig.tick()
     assert set(names) <= rig.up
     if rig.records[-1].state == "STANDBY":
         record = rig.tick(Order("arm"))
         assert record.state == "STANDBY" and any(refused in event.detail for event in record.events), record.events
-    rig = Rig(steady(), extra=extra).run(12, there)
+    rig = Rig(steady(), **settings).run(12, there)
     rig.tick(Order("arm"), told=there)
     assert rig.tick(Order("activate"), told=there).state == "ACTIVE"
     rig.tick()
@@ -536,5 +543,5 @@ def test_a_status_that_is_too_old_is_not_known() -> None:
     old = Surroundings(pdci=STATUS._replace(time_ns=START_NS - 10_000_000_000, in_service=False))
     rig = Rig(steady())
     assert "line_out" not in rig.run(1, old).up
-    rig = Rig(steady(), extra="[pdci]\nrequired = yes")
+    rig = Rig(steady(), pdci="required = yes")
     assert "line_out" in rig.run(1, old).up

@@ -414,5 +414,6 @@ def test_a_log_is_replayed_with_the_defaults_that_it_was_recorded_under(
     names = settings.params.instance_names
     with SessionWriter(path, Head(text, ("A", "B"), names, metadata=metadata)) as log:
         log_tick(log, tick.record, instances=names, pdci=told.pdci, surroundings=told)
-    assert former({}) == former({"defaults": "1"}) == ("pdci.status_age_s=10",) and former({"defaults": "2"}) == ()
+    assert former({}) == former({"defaults": "1"}) == ("pdci.status_age_s=10", "pdci.required=no")
+    assert former({"defaults": "2"}) == ("pdci.required=no",) and former({"defaults": "3"}) == ()
     assert replay(path).different == different

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dcon.cli import dcon
-from dcon.core.params import Pair, Params, Thresholds
+from dcon.core.params import Pair, Params, Required, Thresholds
 from dcon.effective import effective
 from dcon.places import IioPlace
 from dcon.settings import load, parse
@@ -82,7 +82,7 @@ def test_outputs_and_the_line_have_urls() -> None:
     )
     settings = parse(text.replace("[pdci]", "[pdci]\nurl = udp://0.0.0.0:4791?source=192.0.2.31\nrequired = yes"), "x")
     assert isinstance(settings.output.url, IioPlace) and settings.output.url.keys.readback == 1
-    assert settings.output.hold_ms == 50 and settings.params.line.required
+    assert settings.output.hold_ms == 50 and settings.params.required.line
     assert isinstance(settings.line_input.url, Endpoint) and settings.line_input.url.source == "192.0.2.31"
     assert ("pdci", "url", "udp://0.0.0.0:4791?source=192.0.2.31") in [row[:3] for row in effective(settings)]
     assert ("platform", "time_source", "auto") in [row[:3] for row in effective(settings)]
@@ -93,7 +93,7 @@ def test_defaults_are_those_of_the_controller() -> None:
     text = "[pmu A]\nurl = udp://h:1\nside = north\n[pmu B]\nurl = udp://h:2\nside = south\n"
     settings = parse(text, "dcon.ini")
     assert settings.params.thresholds == Thresholds()
-    assert settings.params == Params(pmus=settings.params.pmus, instances=(Pair(0, 1),))
+    assert settings.params == Params(settings.params.pmus, (Pair(0, 1),), required=Required(line=True))
     assert settings.output.url is None
 
 
@@ -665,7 +665,8 @@ def test_a_check_that_cannot_fire_is_a_warning(
     keys: str, idle: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "dcon.ini"
-    path.write_text(f"{PAIR}[controller]\n{keys}\n")
+    safe = PAIR.replace("udp://h:", "udp://127.0.0.1:")
+    path.write_text(f"{safe}[pdci]\nurl = udp://127.0.0.1:3\n[controller]\n{keys}\n")
     assert run(dcon(), ["check", "--ini", str(path), "--json"]) == 0
     out, err = capsys.readouterr()
     warnings = json.loads(out)["warnings"]

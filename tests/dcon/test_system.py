@@ -11,7 +11,7 @@ import pytest
 from support.streams import ARM, play, samples, ticks
 
 from dcon.core.checks import Action, Check, Scope, SystemValue
-from dcon.core.params import Line, Params, Required
+from dcon.core.params import Params, Required
 from dcon.core.rows import CORE
 from dcon.core.state import Instance, State, initial_state
 from dcon.core.step import step
@@ -143,7 +143,7 @@ def test_every_permissive() -> None:
 
 def test_what_is_not_fitted_permits_unless_it_is_required() -> None:
     bare = ArmView(1, 0.0)
-    strict = replace(PAIR, required=Required(True, True, True), line=Line(required=True))
+    strict = replace(PAIR, required=Required(True, True, True, True))
     refused = {row.name for row in PERMISSIVES if not row.test(strict, bare)}
     assert refused == {
         "gps_locked",

@@ -78,7 +78,7 @@ def test_the_site_of_the_page_is_one_that_dcon_takes(capsys: pytest.CaptureFixtu
     assert [site.name for site in settings.sites] == ["N1", "N2", "S1", "S2"]
     assert str(settings.platform.run_dir) == "/var/lib/dcon/run" and settings.output.needs_process
     required = settings.params.required
-    assert required.gps and required.watchdog and required.server and settings.params.line.required
+    assert required.gps and required.watchdog and required.server and required.line
     assert run(dcon(), ["check", "--ini", str(UNITS / "site.ini")]) == 0
     assert "gain_mw_per_mhz" in capsys.readouterr().out
 

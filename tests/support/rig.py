@@ -62,14 +62,19 @@ class Rig:
     """An engine, its PMUs, and what came of every tick."""
 
     def __init__(
-        self, signals: Mapping[str, Signal], *, extra: str = "", gain: float = 9.0, init_s: float = 0.1
+        self,
+        signals: Mapping[str, Signal],
+        *,
+        extra: str = "",
+        pdci: str = "required = no",
+        gain: float = 9.0,
+        init_s: float = 0.1,
     ) -> None:
         self.pmus = some(signals)
         self.signals = signals
         self.streams = {pmu.name: EmulatedStream([pmu], 60) for pmu in self.pmus}
-        self.settings = parse(
-            ini_of(self.pmus, gain_mw_per_mhz=gain, deadband_mhz=0.0, init_s=init_s, extra=f"\n{extra}"), "rig.ini"
-        )
+        law = {"gain_mw_per_mhz": gain, "deadband_mhz": 0.0, "init_s": init_s}
+        self.settings = parse(ini_of(self.pmus, **law, pdci=pdci, extra=f"\n{extra}"), "rig.ini")
         self.engine = Engine(self.settings.params, self.settings.sites)
         self.engine.state = initial_state(self.settings.params, mode=Mode.CLOSED_LOOP, verified=True)
         for name, stream in self.streams.items():

@@ -126,9 +126,6 @@ gps_required = yes
 gps_holdover_s = 0.5
 gap_ms = 500
 latency_max_ms = 500
-[pdci]
-required = yes
-url = udp://127.0.0.1:{line_port}
 [watchdog]
 required = yes
 log = {self.watchdog_log}
@@ -139,7 +136,7 @@ keys = {self.keys}
 [log]
 path = {self.log}
 {extra}"""
-        self.ini.write_text(Streams(names).ini(urls=urls, extra=settings))
+        self.ini.write_text(Streams(names).ini(urls=urls, pdci=f"url = udp://127.0.0.1:{line_port}", extra=settings))
         self.around = Around(self.run_dir, line_port, self.driven_mw)
         self._processes: list[subprocess.Popen[bytes]] = []
         self.run: subprocess.Popen[bytes] | None = None

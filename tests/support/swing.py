@@ -83,9 +83,18 @@ class Streams:
         """What a tick 71 ms after the stamp of ``slot`` is given."""
         return {name: [self.frame(name, slot)] for name in self.streams}
 
-    def ini(self, *, urls: Sequence[str] | None = None, init_s: float = 0.5, extra: str = "") -> str:
+    def ini(
+        self, *, urls: Sequence[str] | None = None, init_s: float = 0.5, pdci: str = "required = no", extra: str = ""
+    ) -> str:
         return ini_of(
-            self.pmus, gain_mw_per_mhz=9.0, deadband_mhz=0.0, rate_hz=60, urls=urls, init_s=init_s, extra=extra
+            self.pmus,
+            gain_mw_per_mhz=9.0,
+            deadband_mhz=0.0,
+            rate_hz=60,
+            urls=urls,
+            init_s=init_s,
+            pdci=pdci,
+            extra=extra,
         )
 
     def settings(self, **given: object) -> Settings:

@@ -1,4 +1,4 @@
-"""What is there twice so that one failure does no harm, and whether the settings leave it so.
+"""What keeps one failure, or anybody at all, from doing harm, and whether the settings leave it so.
 
 Only of a file that a line is to be controlled by: simulations and replays take what was recorded.
 """
@@ -13,7 +13,9 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from dcon.core.clash import Clash
+from dcon.link import paths
 from dcon.places import IioPlace, ModbusLine
+from dcon.watchdog.limits import Rules
 from pmutools.net.endpoint import Endpoint, Scheme
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ LINES = ("estop_a", "estop_b", "relay_a", "relay_b", "contact_a", "contact_b")
 """Keys of ``[watchdog]`` that name a file each."""
 
 
-def check_redundancy(settings: Settings) -> None:
+def check_safeguards(settings: Settings) -> None:
     """Raise Clash for settings that make two safeguards one, or one that cannot work."""
     watchdog, line = settings.watchdog, settings.params.line
     files = {f"watchdog.{name}": getattr(watchdog, name) for name in (*LINES, "log")}
@@ -34,6 +36,8 @@ def check_redundancy(settings: Settings) -> None:
     for name in watchdog.status:
         if name in (".", "..") or "/" in name or "\0" in name:
             raise Clash(f"{name}: is no plain name of a socket in the run folder", "watchdog.status")
+        if name in paths.NAMES and name not in (paths.CONTROL, paths.STATUS):
+            raise Clash(f"{name}: something else is awaited there, and would be crowded out", "watchdog.status")
     where = settings.output.url
     if watchdog.readback == "required" and where is not None and not _reads_back(where):
         problem = f"required: [output] url = {where} reads nothing back, so no relay could stay closed; set it to auto"
@@ -50,9 +54,10 @@ def check_redundancy(settings: Settings) -> None:
         raise Clash(f"0: must be above minimum_mw = {line.minimum_mw:g}", "pdci.rating_ns_mw", "pdci.minimum_mw")
 
 
-def single_safeguards(settings: Settings) -> list[str]:
-    """One line for each safeguard that one failure defeats."""
-    return list(_single(settings))
+def weak_safeguards(settings: Settings) -> list[str]:
+    """One line for each safeguard that one failure defeats or that is left out, each door that stands open, and what
+    keeps everything from being armed."""
+    return [*_single(settings), *_unwatched(settings), *_open(settings), *_never(settings)]
 
 
 def is_same_file(one: str, other: str) -> bool:
@@ -63,7 +68,7 @@ def is_same_file(one: str, other: str) -> bool:
 
 
 def _single(settings: Settings) -> Iterator[str]:
-    watchdog, line = settings.watchdog, settings.line_input.url
+    watchdog = settings.watchdog
     for what, kind in (("line of the emergency stop", "estop"), ("relay", "relay")):
         one, other = getattr(watchdog, f"{kind}_a"), getattr(watchdog, f"{kind}_b")
         if bool(one) != bool(other):
@@ -74,8 +79,39 @@ def _single(settings: Settings) -> Iterator[str]:
             "[watchdog] drive = level: closed relays stay closed if the watchdog dies; "
             "pulse, with a monostable in front of each relay, fails safe"
         )
+
+
+def _unwatched(settings: Settings) -> Iterator[str]:
+    """What nobody looks at."""
+    watchdog = settings.watchdog
+    for each in "ab":
+        if getattr(watchdog, f"contact_{each}") and not getattr(watchdog, f"relay_{each}"):
+            yield f"[watchdog] contact_{each}: relay_{each} is not set, so nothing drives what that contact shows"
+    if unheeded := [name for name in Rules().beats if name not in watchdog.beats]:
+        yield f"[watchdog] beats: without {', '.join(unheeded)}, which may then never beat and close the relays"
+    if not settings.line_input.required:
+        yield "[pdci] required = no: arms without knowing whether the line is in service and takes the command"
+
+
+def _open(settings: Settings) -> Iterator[str]:
+    """Where anybody is listened to."""
+    line = settings.line_input.url
+    for site in settings.sites:
+        url = site.url
+        if url.scheme is Scheme.UDP and url.source is None and not _is_loopback(url.host):
+            yield f"[pmu {site.name}] url = {url}: whoever reaches that port may send its frames; add ?source=ADDRESS"
     if isinstance(line, Endpoint) and line.source is None and not _is_loopback(line.host):
         yield f"[pdci] url = {line}: whoever reaches that port may tell the line's status; add ?source=ADDRESS"
+
+
+def _never(settings: Settings) -> Iterator[str]:
+    """Why nothing can be armed."""
+    if settings.line_input.required and settings.line_input.url is None:
+        yield "[pdci] url is not set: nobody tells the line's status, so nothing can be armed; set it, or required = no"
+    if settings.platform.gps_required and settings.platform.time_source == "none":
+        yield "[platform] gps_required = yes with time_source = none: the lock is never known, so nothing can be armed"
+    if paths.CONTROL not in settings.watchdog.status:
+        yield f"[watchdog] status lacks {paths.CONTROL}: the controller does not hear it, so nothing can be armed"
 
 
 def _reads_back(where: object) -> bool:
