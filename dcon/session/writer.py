@@ -55,7 +55,7 @@ class SessionWriter:
     def write(self, entries: Iterable[Entry], tick_ns: int) -> None:
         """Log entries of the tick at ``tick_ns``: all of them, or some, and more with the same ``tick_ns``."""
         if tick_ns != self._tick_ns:
-            self._log.checkpoint(tick_ns)
+            self._log.boundary(tick_ns)
             self._tick_ns = tick_ns
         write, channels = self._log.write, self._channels
         for message, name, data, log_time_ns, publish_time_ns in entries:

@@ -82,7 +82,7 @@ class LogSink(FrameSink):
             self._configs[key] = config
         logged = pmu_frame(name, frame, unpack_data(frame.data, config, layout_of(config)))
         self._topics.write(logged)
-        self._log.checkpoint(logged.arrival_ns or logged.time_ns)
+        self._log.boundary(logged.arrival_ns or logged.time_ns)
 
     def _put_undecoded(self, frame: Frame, flow: Flow) -> None:
         key = (flow.ends, frame.idcode)
@@ -92,7 +92,7 @@ class LogSink(FrameSink):
             name = self._undecoded[key] = unique([f"stream-{frame.idcode}"], taken)[0]
         logged = undecoded_frame(name, frame)
         self._topics.write(logged)
-        self._log.checkpoint(logged.arrival_ns or logged.time_ns)
+        self._log.boundary(logged.arrival_ns or logged.time_ns)
 
     def flush(self) -> None:
         self._log.flush()

@@ -72,7 +72,7 @@ class LogWriter:
         if self._chunk.size > CHUNK_BYTES:
             self._end_chunk()
 
-    def checkpoint(self, now_ns: int) -> None:
+    def boundary(self, now_ns: int) -> None:
         """Say that nothing written later belongs to what was written before; flushes once a second of log time."""
         # a clock set back must not put the flush off
         if self._chunk_start_ns is not None and abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:

@@ -37,7 +37,7 @@ def small_log(target: Any) -> None:
         channel = log.channel("/dcon/event", "Event", {"unit": "none"})
         for k in range(15):
             now_ns = T0 + k * NS // 3
-            log.checkpoint(now_ns)
+            log.boundary(now_ns)
             log.write(channel, event(now_ns, "x" * k), now_ns, now_ns - 1)
             if k == 7:
                 log.attach("N1.cfg2", b"\xaa\x31 bytes", now_ns)
@@ -193,7 +193,7 @@ def long_log(path: Path) -> tuple[bytes, bytes]:
     channels = [log.channel("/dcon/event", "Event"), log.channel("/dcon/setting", "Setting")]
     for k in range(80):
         now_ns = T0 + k * NS // 2
-        log.checkpoint(now_ns)
+        log.boundary(now_ns)
         log.write(channels[k % 2], event(now_ns, "x" * 400), now_ns, now_ns)
     log.flush()
     killed = path.read_bytes()
@@ -422,7 +422,7 @@ def test_memory_is_bounded_by_a_chunk(tmp_path: Path) -> None:
             channel = log.channel("/dcon/event", "Event")
             for k in range(40):
                 log.write(channel, chunk + bytes([k]), T0 + k * NS, T0)
-                log.checkpoint(T0 + (k + 1) * NS)
+                log.boundary(T0 + (k + 1) * NS)
         assert sum(1 for _ in LogReader(path).records()) == 40
         assert tracemalloc.get_traced_memory()[1] < 8 * len(chunk)
     finally:
