@@ -7,8 +7,10 @@ clock and no socket; what it cannot read is counted and treated as missing, so n
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from dcon.core.params import Params
 from dcon.core.pmu import end_run
@@ -23,12 +25,24 @@ from pmutools.schema.pmu_log import PmuFrame
 from pmutools.sites import Site
 
 
+class Memory(NamedTuple):
+    """All that the ticks to come depend on, beside the settings and what they are given."""
+
+    state: State
+    notes: tuple[Event, ...]
+    """Events that the next tick will tell: of configurations that came before it."""
+    configs: tuple[tuple[str, str], ...]
+    """PMUs, sorted, and the digest of the configuration that is in force for each."""
+
+
 @dataclass(frozen=True)
 class Tick:
     """What one tick decided, and what it read, in the order read."""
 
     record: Record
     readings: tuple[Reading, ...]
+    memory: Memory
+    """What the engine knew just before it."""
     surroundings: Surroundings = NOTHING
     """What it was told, with the frames that it could not read."""
 
@@ -39,7 +53,11 @@ class Tick:
 
 
 class Engine:
-    """The controller's memory and its PMUs' bindings."""
+    """The controller's memory and its PMUs' bindings.
+
+    :attr:`memory` is all of it that a tick depends on: an engine with the same settings that is given it by
+    :meth:`resume` goes on bit for bit alike.
+    """
 
     def __init__(
         self, params: Params, sites: Iterable[Site], *, mode: Mode = Mode.OPEN_LOOP, verified: bool = False
@@ -56,10 +74,30 @@ class Engine:
         self.configs: dict[str, StreamConfig] = {}
         """Newest configuration of each PMU, usable or not."""
         self._notes: list[Event] = []
+        self._digests: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def memory(self) -> Memory:
+        """What is known now, for :meth:`resume`."""
+        return Memory(self.state, tuple(self._notes), self._digests)
+
+    def resume(self, memory: Memory, configs: Mapping[str, StreamConfig]) -> None:
+        """Go on from ``memory``, with ``configs`` in force.
+
+        Raises ValueError where other configurations were in force: only those tell how frames are read.
+        """
+        self.configs, self.bindings = {}, {}
+        for name, config in configs.items():
+            with suppress(SettingsError):  # unusable then as now
+                self.configure(name, config)
+        if self._digests != memory.configs:
+            raise ValueError("other configurations were in force")
+        self.state, self._notes = memory.state, list(memory.notes)
 
     def configure(self, name: str, config: StreamConfig) -> None:
         """A PMU's configuration came. Raises SettingsError where the PMU cannot be used with it: it is then unread."""
         self.configs[name] = config
+        self._digests = tuple((each, self.configs[each].digest) for each in sorted(self.configs))
         self.bindings.pop(name, None)
         if name not in self._index:
             raise SettingsError(f"no PMU {name!r} in the settings; there are {', '.join(self._index)}")
@@ -107,6 +145,7 @@ class Engine:
 
         ``surroundings`` is what the tick is told besides; frames that cannot be read are added to it.
         """
+        memory = self.memory
         samples: list[list[Sample]] = [[] for _ in self.sites]
         readings: list[Reading] = []
         lost = [0] * len(samples)
@@ -131,4 +170,4 @@ class Engine:
         if self._notes:
             record = record._replace(events=(*self._notes, *record.events))
             self._notes = []
-        return Tick(record, tuple(readings), surroundings)
+        return Tick(record, tuple(readings), memory, surroundings)

@@ -28,6 +28,7 @@ from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
 from dcon.link.command import RELAYS
 from dcon.link.crossing import Failure, Item, PmuFrameIn
+from dcon.session import checkpoint
 from dcon.session.codec import Timing
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
@@ -234,7 +235,9 @@ class Platform:
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
         names, record = self.settings.params.instance_names, tick.record
-        entries = tick_entries(names, record, tick.readings, orders, timing=timing, surroundings=tick.surroundings)
+        memory = tick.memory if checkpoint.is_due(self.summary.ticks, self.settings.params.tick_hz) else None
+        given = (names, record, tick.readings, orders)
+        entries = tick_entries(*given, timing=timing, surroundings=tick.surroundings, memory=memory)
         log.write(entries, record.tick_ns)
 
     def _take(self, items: Sequence[Item]) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from dcon.core.values import NOTHING, Order, Pdci, Record, Surroundings
+from dcon.engine import Memory
 from dcon.link.bundle import Entry
 from dcon.session import codec
+from dcon.session.checkpoint import encode_checkpoint
 from dcon.session.codec import Timing, Watchdog
 from pmutools.schema.pmu_log import Loggable
 
@@ -22,12 +24,14 @@ def tick_entries(
     timing: Timing | None = None,
     pdci: Pdci | None = None,
     surroundings: Surroundings = NOTHING,
+    memory: Memory | None = None,
 ) -> list[Entry]:
     """One tick: the ``frames``, ``orders`` and ``surroundings`` it was given, what it decided, how it ran.
 
     ``instances`` are the names that ``record.active`` counts in. ``frames`` in the order in which the controller got
-    them. ``pdci`` is the line's status beside the tick; by default the one that the tick was told. Raises ValueError
-    for a tick that is no POSIX time: a frame's tick 0 means none.
+    them. ``pdci`` is the line's status beside the tick; by default the one that the tick was told. With
+    ``memory``, the engine's before the tick, it is a checkpoint. Raises ValueError for a tick that is no POSIX time: a
+    frame's tick 0 means none.
     """
     tick_ns = record.tick_ns
     if tick_ns <= 0:
@@ -40,6 +44,8 @@ def tick_entries(
     def add(message: str, data: bytes, time_ns: int = tick_ns) -> None:
         entries.append(_new(Entry, (message, "", data, tick_ns, time_ns)))
 
+    if memory is not None and (checkpoint := encode_checkpoint(tick_ns, memory)) is not None:
+        add("Checkpoint", checkpoint)
     for order in orders:
         add("Setting", codec.encode_order(tick_ns, order))
     if surroundings != NOTHING:

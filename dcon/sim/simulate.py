@@ -15,6 +15,7 @@ from dcon.core.rows import CORE
 from dcon.core.values import Event, Mode, Pdci, Record
 from dcon.engine import Engine
 from dcon.limiter import MW_PER_V
+from dcon.session import checkpoint
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.writer import SessionWriter
@@ -201,7 +202,9 @@ def _run(
             tell(outcome.tick_s[-1])
         if log is not None:
             line, around = _line(grid, tick_ns), tick.surroundings
-            log.write(tick_entries(names, tick.record, tick.readings, orders, pdci=line, surroundings=around), tick_ns)
+            memory = tick.memory if checkpoint.is_due(number, engine.params.tick_hz) else None
+            given = (names, tick.record, tick.readings, orders)
+            log.write(tick_entries(*given, pdci=line, surroundings=around, memory=memory), tick_ns)
 
 
 def _arrived(

@@ -8,6 +8,7 @@ Layouts: CFG-1 and CFG-2 clause 6.4 and Table 8, CFG-3 clause 6.5 and Table 10.
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -190,6 +191,11 @@ class StreamConfig:
     @cached_property
     def _key(self) -> tuple[int, int, bytes]:
         return self.kind, self.idcode, self.body
+
+    @cached_property
+    def digest(self) -> str:
+        """What tells it from others that are not equal: 64 bits in hexadecimal."""
+        return hashlib.sha256(f"{self.kind:d} {self.idcode} ".encode() + self.body).hexdigest()[:16]
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, StreamConfig) and self._key == other._key)

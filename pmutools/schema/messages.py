@@ -190,4 +190,13 @@ MESSAGES: dict[str, MessageType] = {
             Field("relays_closed", "bool", "By the watchdog's word, the command passes."),
         ),
     ),
+    "Checkpoint": MessageType(
+        "/dcon/checkpoint",
+        "All that the controller remembered before a tick, now and then: a replay can begin with it.",
+        (
+            _TICK,
+            Field("layout", "string", "What the numbers of memory are of: only a program with the same reads it."),
+            Field("memory", "string", "Nested lists as JSON, with NaN and Infinity; every number is exact."),
+        ),
+    ),
 }

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.random_sessions import FOUR
 from support.sessions import (
     CONFIGS,
     FLAGS,
@@ -34,7 +35,11 @@ from support.sessions import (
 )
 
 import pmutools
+from dcon.core.state import initial_state
 from dcon.core.values import Inputs, Sample
+from dcon.engine import Memory
+from dcon.link.bundle import Entry
+from dcon.session.checkpoint import encode_checkpoint
 from dcon.session.codec import Watchdog
 from dcon.session.encode import tick_entries
 from dcon.session.reader import LoggedTick, SessionReader
@@ -106,6 +111,8 @@ def test_every_topic_is_decoded_by_any_mcap_reader(tmp_path: Path) -> None:
     ticks = random_ticks(200)
     with open_session(path) as session:
         log_watchdog(session, Watchdog(T0, False, estop=True, reason="E-stop", heartbeats=(("control", 3.5),)))
+        memory = encode_checkpoint(T0, Memory(initial_state(FOUR), (), ()))
+        session.write([Entry("Checkpoint", "", memory or b"", T0, T0)], T0)
         for tick in ticks:
             write_tick(session, tick)
     seen: dict[str, int] = {}
