@@ -191,7 +191,7 @@ class Log:
     path: str = field(default="session.mcap", metadata=parsed_by(str))
     """Of the first part; the others are ``session.part2.mcap``, ``session.part3.mcap``, ... beside it."""
     max_mb: float = field(default=1000.0, metadata=parsed_by(number(1, 1e6)))
-    """A part of so many megabytes is ended, and the next begun."""
+    """A part of so many megabytes is ended at the next checkpoint, and another begun."""
     max_minutes: float = field(default=60.0, metadata=parsed_by(number(1, 1e6)))
     """So is one that spans so much time."""
     backfill_s: float = field(default=120.0, metadata=parsed_by(number(1, 3600)))

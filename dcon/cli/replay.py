@@ -46,7 +46,8 @@ def command(
 ) -> int:
     """Replay a session log, tick by tick, from its logged bytes and arrivals.
 
-    The first part of a session brings those that follow it; or name the parts.
+    The first part of a session brings those that follow it; or name the parts. Behind a gap, and in a later part alone,
+    the replay begins with the next checkpoint; the ticks before it are counted as not replayed.
 
     Exit code 3 says that something came out otherwise (without --set), or that the log could not be replayed whole.
     With --set the answer is what the controller would have commanded, not what the grid would have done.
@@ -87,7 +88,7 @@ def command(
     for problem in result.problems:
         talk.say(problem)
     if result.stopped:
-        talk.say(f"stopped: {result.stopped}")
+        talk.say(f"{'not whole' if result.gaps and result.to_the_end else 'stopped'}: {result.stopped}")
     return Exit.INCOMPLETE if result.stopped or (result.different and not changes) else Exit.DONE
 
 

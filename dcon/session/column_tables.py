@@ -147,7 +147,7 @@ class SessionColumns:
     newer: Newer = field(default_factory=Newer)
     """What the log holds that this program does not know."""
     missing: list[str] = field(default_factory=list)
-    """What is not there between the parts, in words."""
+    """What is not there before and between the parts, in words."""
 
     def flag(self, name: str) -> npt.NDArray[np.bool_]:
         """(T,) whether a flag is up at each tick. Raises KeyError for a name that the session lacks."""

@@ -38,7 +38,7 @@ from dcon.session.column_tables import (
     TickColumns,
 )
 from dcon.session.newer import newer_in
-from dcon.session.parts import Part, Paths, is_apart
+from dcon.session.parts import Part, Paths, lost
 from dcon.session.reader import SessionReader
 from pmutools.schema.columns import Texts, decode_columns
 from pmutools.schema.descriptors import message_class, unnamed_fields
@@ -72,11 +72,11 @@ def read_columns(paths: Paths, tables: Collection[str] = TABLES) -> SessionColum
     reader.reset_damage()
     before: Part | None = None
     for part in reader.parts:
-        if before is not None and is_apart(before, part):
+        if lost(before, part):
             builder.gap()
-        for batch, lost in _batches(part.log, wanted):
+        for batch, is_damaged in _batches(part.log, wanted):
             builder.take(batch)
-            if lost:
+            if is_damaged:
                 builder.gap()
         before = part
     return builder.session()

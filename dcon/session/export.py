@@ -36,7 +36,7 @@ class ExportSummary(NamedTuple):
     damage: Damage
     newer: Newer = Newer()
     missing: tuple[str, ...] = ()
-    """What is not there between the parts, in words."""
+    """What is not there before and between the parts, in words."""
 
 
 def export(session: Paths, out: str | os.PathLike[str], table: str = "tick") -> ExportSummary:
@@ -88,7 +88,7 @@ class _Rows:
     def _rows(self) -> Iterator[Row]:
         rows = self._table.rows(self._reader)
         for group in self._reader.groups(self._table.messages):
-            self.gaps += group.after_loss
+            self.gaps += bool(group.lost)
             yield from rows(group)
 
 

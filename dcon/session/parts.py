@@ -113,21 +113,29 @@ def named_twice(one: Part, other: Part) -> SourceError:
 
 
 def missing(parts: Sequence[Part]) -> list[str]:
-    """What is not there between the parts of a session, in words; damage within a part is told by its reader."""
+    """What is not there before and between parts of a session, in words; damage within one is told by its reader."""
+    return [line for before, part in zip((None, *parts), parts, strict=False) for line in _absent(before, part)]
+
+
+def lost(before: Part | None, part: Part) -> str:
+    """What is missing between two parts, the first of which has been read to its end; "" is nothing.
+
+    ``before`` is None for the first that is read.
+    """
+    return "; ".join([*_absent(before, part), *([] if before is None else before.log.damage.lines())])
+
+
+def _absent(before: Part | None, part: Part) -> list[str]:
     lines: list[str] = []
-    for before, part in pairwise(parts):
-        absent = [str(number) for number in range(before.number + 1, part.number)]
-        if absent:
-            which = f"part {absent[0]} is" if len(absent) == 1 else f"parts {absent[0]} to {absent[-1]} are"
-            lines.append(f"{which} missing, part {part.number} is there")
-        if part.unlogged:
-            lines.append(f"{part.unlogged} ticks before part {part.number} were not logged")
+    absent = [] if before is None else [str(number) for number in range(before.number + 1, part.number)]
+    if absent:
+        which = f"part {absent[0]} is" if len(absent) == 1 else f"parts {absent[0]} to {absent[-1]} are"
+        lines.append(f"{which} missing, part {part.number} is there")
+    if part.unlogged and part.number == 1:
+        lines.append(f"the first {part.unlogged} ticks were not logged")
+    elif part.unlogged:
+        lines.append(f"{part.unlogged} ticks before part {part.number} were not logged")
     return lines
-
-
-def is_apart(before: Part, part: Part) -> bool:
-    """Whether anything is missing between two parts, the first of which has been read to its end."""
-    return bool(before.log.damage or part.unlogged or part.number != before.number + 1)
 
 
 def later_paths(first: str | os.PathLike[str]) -> dict[int, Path]:

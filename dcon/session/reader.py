@@ -15,7 +15,7 @@ from dcon.core.values import NOTHING, Inputs, Order, Pdci, Record, Sample, Surro
 from dcon.session import codec
 from dcon.session.codec import Timing
 from dcon.session.head import INI_NAME, PROBE_NAME
-from dcon.session.parts import SESSION, Part, Paths, is_apart, missing, parts_of
+from dcon.session.parts import SESSION, Part, Paths, lost, missing, parts_of
 from pmutools.errors import SourceError
 from pmutools.schema.log_reader import Damage, LogAttachment, LogMessage, LogReader
 from pmutools.schema.messages import MESSAGES
@@ -50,7 +50,8 @@ class TickMessages:
     """The decoded protobuf messages of one tick, by name; frames as (PMU, message)."""
 
     tick_ns: int
-    after_loss: bool
+    lost: str
+    """What of the log is missing just before this tick, in words; "" is nothing."""
     frames: list[tuple[str, Any]] = field(default_factory=list)
     messages: dict[str, list[Any]] = field(default_factory=dict)
     configs: list[tuple[str, bytes]] = field(default_factory=list)
@@ -101,14 +102,14 @@ class SessionReader:
 
     @property
     def missing(self) -> list[str]:
-        """What is not there between the parts, in words."""
+        """What is not there before and between the parts, in words."""
         return missing(self.parts)
 
     def ticks(self) -> Iterator[LoggedTick]:
         """Every whole tick with its inputs, in file order."""
         loss = False
         for group in self.groups(TICK_MESSAGES):
-            loss |= group.after_loss
+            loss |= bool(group.lost)
             try:
                 tick = logged_tick(group, loss)
             except ValueError:
@@ -123,12 +124,12 @@ class SessionReader:
         self.incomplete_ticks = 0
         self.reset_damage()
         before: Part | None = None
-        loss = False
+        losses: list[str] = []
         for part in self.parts:
-            loss |= before is not None and is_apart(before, part)
+            losses.append(lost(before, part))
             for group in self._groups(part.log, messages):
-                group.after_loss |= loss
-                loss = False
+                group.lost = "; ".join(filter(None, (*losses, group.lost)))
+                losses.clear()
                 yield group
             before = part
 
@@ -153,7 +154,7 @@ class SessionReader:
             if group is None or tick_ns != group.tick_ns:
                 if group is not None:
                     yield group
-                group = TickMessages(tick_ns, after_loss=log.damage.losses > losses, configs=configs)
+                group = TickMessages(tick_ns, DAMAGED if log.damage.losses > losses else "", configs=configs)
                 configs = []
                 losses = log.damage.losses
             if kind == "PmuFrame":
@@ -176,6 +177,8 @@ class SessionReader:
         return None
 
 
+DAMAGED = "what is there cannot be read"
+"""Lost within a part."""
 _TIMES = {name: "tick_ns" if name == "PmuFrame" else message.fields[0].name for name, message in MESSAGES.items()}
 """Field of each message that names its tick; of one that belongs to none, its time."""
 TICK_MESSAGES = frozenset(

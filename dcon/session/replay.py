@@ -5,33 +5,31 @@ CHK and decode to what the log says; the first difference is reported with the t
 the result is what the controller would have *commanded*: the grid that answered is the recorded one, so nothing is
 said of what the grid would have done.
 
-What is compared first are the bytes of the messages: they are the same where every value is, and nothing needs to be
-decoded for that. Events of the log itself are not the controller's, and are passed over.
+What the controller knew behind a gap is not in the log but at the next checkpoint, and there the replay goes on. With
+changed settings it does not: the controller of that checkpoint had the recorded ones.
 """
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import pmutools
-from dcon.core.values import Order, Record
+from dcon.core.values import Record
 from dcon.engine import Engine, Tick
 from dcon.session import codec
+from dcon.session.checkpoint import decode_checkpoint
 from dcon.session.defaults import former
+from dcon.session.difference import Difference, changed, changed_frame, changed_memory, same_bytes
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
-from dcon.session.reader import TICK_MESSAGES, LoggedTick, SessionReader, TickMessages, logged_tick
-from dcon.session.rolling import LOG_SUBJECT
+from dcon.session.reader import TICK_MESSAGES, SessionReader, TickMessages, logged_tick
 from dcon.settings import parse
-from pmutools.c37118 import Frame, decode_config
-from pmutools.c37118.checksum import chk
+from pmutools.c37118 import Frame, StreamConfig, decode_config
 from pmutools.errors import SourceError, WireError
 from pmutools.flow import StampSource
-from pmutools.schema.pmu_log import PmuFrame
 
 NOT_THE_GRID = "This is the command, not the grid: the recorded grid answered to the recorded command."
 """What is to be said of a replay with changed settings."""
@@ -54,60 +52,23 @@ Observer = Callable[[Driven, Record], None]
 """(what was recorded, the record of the tick now)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """The first field of a tick's record that came out otherwise, or ``frame`` and the one that is not as logged."""
+@dataclass
+class Gap:
+    """A place where what the controller knew is not in the log: the ticks there are not judged."""
 
     tick_ns: int
-    field: str
-    recorded: Any
-    replayed: Any
-    before: str
-    """How the tick before ended."""
-    frames: tuple[PmuFrame, ...]
-    orders: tuple[Order, ...]
+    """The first tick behind it."""
+    why: str
+    ticks: int = 0
+    """From there on, that could not be replayed."""
+    passed: bool = False
+    """A checkpoint came, and the replay went on with it."""
 
     def __str__(self) -> str:
-        inputs = [f"before: {self.before}"]
-        inputs += [
-            f"{frame.name}: stamp {frame.time_ns}, arrival {frame.arrival_ns}, V1 {abs(frame.v1):.3f} V at "
-            f"{math.degrees(cmath.phase(frame.v1)):.4f}°, {frame.frequency_hz:.6f} Hz, STAT {frame.stat:#06x}"
-            for frame in self.frames
-        ]
-        inputs += [
-            f"order: {order.name}" + (f" {order.given:g}" if order.given is not None else "") for order in self.orders
-        ]
-        what = f"tick {self.tick_ns}: {self.field} {self.recorded!r} -> {self.replayed!r}"
-        return "\n  ".join((what, *(inputs if self.frames or self.orders else [*inputs, "no frames"])))
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "tick_ns": self.tick_ns,
-            "field": self.field,
-            "recorded": _plain(self.recorded),
-            "replayed": _plain(self.replayed),
-            "before": self.before,
-            "frames": [
-                {
-                    "pmu": frame.name,
-                    "time_ns": frame.time_ns,
-                    "arrival_ns": frame.arrival_ns,
-                    "v1_re": _plain(frame.v1.real),
-                    "v1_im": _plain(frame.v1.imag),
-                    "frequency_hz": _plain(frame.frequency_hz),
-                    "stat": frame.stat,
-                }
-                for frame in self.frames
-            ],
-            "orders": [{"name": order.name, "value": _plain(order.given)} for order in self.orders],
-        }
-
-
-def _plain(value: object) -> object:
-    """A value that JSON has; NaN, infinities and tuples as text."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return repr(value)
-    return value if isinstance(value, int | float | str | None) else repr(value)
+        return (
+            f"the log lost something before tick {self.tick_ns} ({self.why}); "
+            f"{self.ticks} ticks from there on are not replayed"
+        )
 
 
 @dataclass
@@ -115,9 +76,11 @@ class Replay:
     """What came of it. ``stopped`` says why not every tick could be replayed."""
 
     ticks: int = 0
+    """That were replayed."""
     different: int = 0
     first: Difference | None = None
     changes: tuple[str, ...] = ()
+    gaps: list[Gap] = field(default_factory=list)
     stopped: str = ""
     problems: list[str] = field(default_factory=list)
     """Configurations that could not be used, in words."""
@@ -126,12 +89,19 @@ class Replay:
     newer: Newer = field(default_factory=Newer)
     """What the log holds that this program does not know."""
 
+    @property
+    def to_the_end(self) -> bool:
+        """The last ticks of the log were replayed, whatever was not before them."""
+        return all(gap.passed for gap in self.gaps)
+
     def to_json(self) -> dict[str, Any]:
         return {
             "ticks": self.ticks,
+            "not_replayed": sum(gap.ticks for gap in self.gaps),
             "different": self.different,
             "first": self.first.to_json() if self.first else None,
             "changes": list(self.changes),
+            "gaps": [{"tick_ns": gap.tick_ns, "why": gap.why, "not_replayed": gap.ticks} for gap in self.gaps],
             "stopped": self.stopped or None,
             "problems": self.problems,
             "newer": self.newer.to_json(),
@@ -147,147 +117,158 @@ def replay(
 ) -> Replay:
     """Replay a session log, with ``SECTION.KEY=VALUE`` changes laid over its settings.
 
-    ``observe`` is shown every tick. Ticks ``duration_ns`` after the first, and later ones, are left out. Raises
-    SourceError for what is no session log or not its beginning, SettingsError for settings that cannot be.
+    ``observe`` is shown every tick that is replayed. Ticks ``duration_ns`` after the log's first, and later ones, are
+    left out. Raises SourceError for what is no session log, or one that is not its beginning and has no checkpoint,
+    SettingsError for settings that cannot be.
     """
     reader = SessionReader(paths)
-    if reader.parts[0].number > 1:
-        first = reader.metadata.get("first", "")
-        raise SourceError(
-            f"{reader.path}: part {reader.parts[0].number} of a session; a replay starts with the first"
-            f"{first and f', {first}'}"
-        )
     if not reader.ini_text:
         raise SourceError(f"{reader.path}: the log holds no initialisation file (its beginning is lost), so no replay")
     name, defaults = f"{reader.path}: {_INI}", former(reader.metadata)
     settings = parse(reader.ini_text, name, tuple(changes), probe_file=reader.probe_file, defaults=defaults)
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
-    result = Replay(changes=tuple(changes))
-    before = "the session begins"
-    ended, end_ns = False, math.inf
-    for group in reader.groups(TICK_MESSAGES):
-        logged = group.one("Tick")
-        if not result.ticks and duration_ns is not None:
-            end_ns = group.tick_ns + duration_ns
+    course = _Course(engine, reader.instances, tuple(changes), observe)
+    result, later = course.result, reader.parts[0].number > 1
+    end_ns: float | None = None
+    for group in reader.groups(_MESSAGES):
+        if end_ns is None:
+            end_ns = math.inf if duration_ns is None else group.tick_ns + duration_ns
+            if later and not group.lost:
+                group.lost = f"what is read begins with part {reader.parts[0].number}"
         if group.tick_ns >= end_ns:
-            ended = True
             break
-        if group.after_loss:
-            result.stopped = "; ".join((f"the log lost something before tick {group.tick_ns}", *reader.missing))
-            break
-        if logged is None or group.one("Instance") is None:
-            result.stopped = f"tick {group.tick_ns} is not whole"
-            break
-        now = _again(engine, group, result)
-        result.ticks += 1
-        recorded, driven = Driven.of(logged), Driven.of(now.record)
-        if recorded != driven:
-            changes_now = (abs(one - other) for one, other in zip(recorded, driven, strict=True))
-            result.largest = Driven(*map(max, result.largest, changes_now))
-        if not _same_bytes(group, now, reader.instances, frames=not changes):
-            try:
-                tick = logged_tick(group)
-            except ValueError as error:
-                result.stopped = str(error)
-                break
-            found = (None if changes else _changed_frame(tick, now.frames)) or _changed_record(tick.record, now.record)
-            if found is not None:
-                result.different += 1
-                result.first = result.first or Difference(group.tick_ns, *found, before, tick.frames, tick.orders)
-        if observe is not None:
-            observe(recorded, now.record)
-        before = (
-            f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
-            f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"
+        course.take(group)
+    else:
+        end_ns = None
+    if later and not result.ticks:
+        first = reader.metadata.get("first", "")
+        raise SourceError(
+            f"{reader.path}: part {reader.parts[0].number} of a session; a replay starts with the first"
+            f"{first and f', {first}'}"
         )
+    if later and result.gaps[0].passed and not result.gaps[0].ticks:
+        del result.gaps[0]  # nothing of what was named is missing
     result.newer = newer_in(reader)
     version = reader.metadata.get("version", "")
     if result.different and not changes and version != pmutools.__version__:
         result.problems.append(f"recorded by version {version or 'unknown'}, replayed by {pmutools.__version__}")
-    if not result.stopped and not ended:
-        result.stopped = "; ".join((*reader.missing, *reader.damage.lines()))
+    result.stopped = "; ".join(_lacking(result.gaps, reader, at_end=end_ns is None))
     if not result.ticks and not result.stopped:
         raise SourceError(f"{reader.path}: holds no tick")
     return result
 
 
 _INI = "initialisation file"
+_MESSAGES = TICK_MESSAGES | {"Checkpoint"}
 _STAMP_SOURCES = {str(source): source for source in StampSource}
 
 
-def _again(engine: Engine, group: TickMessages, result: Replay) -> Tick:
-    """The tick, from what the log says it was given."""
-    for name, config_frame in group.configs:
+def _lacking(gaps: Sequence[Gap], reader: SessionReader, *, at_end: bool) -> list[str]:
+    """Why not all was replayed: gaps, and ``at_end`` what else is not there."""
+    told = [gap.why for gap in gaps]
+    others = [*reader.missing, *reader.damage.lines()] if at_end else []
+    return [*map(str, gaps), *(line for line in others if not any(line in why for why in told))]
+
+
+class _Course:
+    """A replay under way: takes the log tick by tick."""
+
+    def __init__(
+        self, engine: Engine, instances: Sequence[str], changes: tuple[str, ...], observe: Observer | None
+    ) -> None:
+        self.result = Replay(changes=changes)
+        self._engine = engine
+        self._instances = instances
+        self._observe = observe
+        self._before = "the session begins"
+        self._configs: dict[str, bytes] = {}
+        """Newest of each PMU."""
+        self._gap: Gap | None = None
+        """Where the engine's memory was lost; None while it is that of the controller."""
+
+    def take(self, group: TickMessages) -> None:
+        """Replay one tick, or count it."""
+        self._configs.update(group.configs)
+        if group.lost:
+            self._lose(group, group.lost)
+        if self._gap is not None and not self._resumes(group, self._gap):
+            self._gap.ticks += group.one("Tick") is not None
+            return
+        if group.one("Tick") is None or group.one("Instance") is None:
+            self._lose(group, f"tick {group.tick_ns} is not whole")
+            return
         try:
-            config = decode_config(config_frame)[1]
-        except WireError as error:
-            result.problems.append(f"{name}: {error}")
-            continue
-        if (problem := engine.reconfigure(name, config)) is not None:
-            result.problems.append(problem)
-    frames: dict[str, list[Frame]] = {}
-    for name, message in group.frames:
-        source = _STAMP_SOURCES.get(message.stamp_source, StampSource.CAPTURE)
-        frames.setdefault(name, []).append(Frame(message.wire, message.arrival_ns or None, source, 0))
-    orders = tuple(map(codec.decode_order, group.messages.get("Setting", ())))
-    return engine.tick(frames, orders, group.tick_ns, codec.decode_surroundings(group.one("Surroundings")))
+            self._replay(group)
+        except ValueError as error:
+            self._lose(group, str(error))
 
+    def _lose(self, group: TickMessages, why: str) -> None:
+        if self._gap is None:
+            self._gap = Gap(group.tick_ns, why)
+            self.result.gaps.append(self._gap)
 
-def _same_bytes(group: TickMessages, now: Tick, instances: Sequence[str], *, frames: bool) -> bool:
-    """Whether the tick's messages come out the same byte for byte, and, with ``frames``, every frame holds its CHK."""
-    record, data = now.record, group.data
-    if codec.encode_tick(record, instances) != data["Tick"][0] or codec.encode_instances(record) != data["Instance"][0]:
-        return False
-    logged = [
-        wire
-        for event, wire in zip(group.messages.get("Event", ()), data.get("Event", ()), strict=True)
-        if event.subject != LOG_SUBJECT
-    ]
-    if [codec.encode_event(record.tick_ns, event) for event in record.events] != logged:
-        return False
-    if [codec.encode_flag(record.tick_ns, flag) for flag in record.flag_changes] != data.get("Flag", []):
-        return False
-    if not frames:
+    def _resumes(self, group: TickMessages, gap: Gap) -> bool:
+        """Whether the controller's memory is known again."""
+        memory = None if self.result.changes else decode_checkpoint(group.one("Checkpoint"))
+        if memory is None:
+            return False
+        configs = {name: config for name, frame in self._configs.items() if (config := self._decoded(name, frame))}
+        try:
+            self._engine.resume(memory, configs)
+        except ValueError:
+            return False
+        gap.passed, self._gap = True, None
+        self._before = "a checkpoint"
         return True
-    found = [reading.encode(record.tick_ns) for reading in now.readings]
-    return found == data.get("PmuFrame", []) and not any(chk(message.wire) for _, message in group.frames)
 
+    def _replay(self, group: TickMessages) -> None:
+        """Raises ValueError for a tick that this program does not understand."""
+        result, logged = self.result, group.one("Tick")
+        assert logged is not None
+        now = self._again(group)
+        difference = self._difference(group, now)
+        if difference is not None:
+            result.different += 1
+            result.first = result.first or difference
+        result.ticks += 1
+        recorded, driven = Driven.of(logged), Driven.of(now.record)
+        if recorded != driven:
+            changes_now = (abs(one - other) for one, other in zip(recorded, driven, strict=True))
+            result.largest = Driven(*map(max, result.largest, changes_now))
+        if self._observe is not None:
+            self._observe(recorded, now.record)
+        self._before = (
+            f"{logged.state} {logged.mode}, {logged.active_instance or 'no instance'} active, "
+            f"{logged.gain_mw_per_mhz:g} MW/mHz, command {logged.command_mw!r} MW"
+        )
 
-def identical(one: object, other: object) -> bool:
-    """Equal to the last bit, NaN and -0.0 too, through tuples."""
-    if isinstance(one, complex) and isinstance(other, complex):
-        one, other = (one.real, one.imag), (other.real, other.imag)
-    if isinstance(one, float) and isinstance(other, float):
-        if one == other:
-            return one != 0 or math.copysign(1, one) == math.copysign(1, other)
-        return math.isnan(one) and math.isnan(other)
-    if isinstance(one, tuple) and isinstance(other, tuple):
-        return len(one) == len(other) and all(map(identical, one, other))
-    return one == other
+    def _again(self, group: TickMessages) -> Tick:
+        """The tick, from what the log says it was given."""
+        for name, frame in group.configs:
+            if (config := self._decoded(name, frame)) is not None:
+                problem = self._engine.reconfigure(name, config)
+                self.result.problems += [] if problem is None else [problem]
+        frames: dict[str, list[Frame]] = {}
+        for name, message in group.frames:
+            source = _STAMP_SOURCES.get(message.stamp_source, StampSource.CAPTURE)
+            frames.setdefault(name, []).append(Frame(message.wire, message.arrival_ns or None, source, 0))
+        orders = tuple(map(codec.decode_order, group.messages.get("Setting", ())))
+        return self._engine.tick(frames, orders, group.tick_ns, codec.decode_surroundings(group.one("Surroundings")))
 
+    def _decoded(self, name: str, frame: bytes) -> StreamConfig | None:
+        try:
+            return decode_config(frame)[1]
+        except WireError as error:
+            if (problem := f"{name}: {error}") not in self.result.problems:
+                self.result.problems.append(problem)
+            return None
 
-def _changed_record(recorded: object, replayed: object, name: str = "") -> tuple[str, object, object] | None:
-    """The first value that differs, with its place: ``instances.3.command_mw``."""
-    if isinstance(recorded, Record):
-        events = tuple(event for event in recorded.events if event.subject != LOG_SUBJECT)
-        recorded = recorded._replace(events=events)
-    if identical(recorded, replayed):
-        return None
-    if isinstance(recorded, tuple) and isinstance(replayed, tuple) and len(recorded) == len(replayed):
-        places = getattr(recorded, "_fields", range(len(recorded)))
-        for place, one, other in zip(places, recorded, replayed, strict=True):
-            if found := _changed_record(one, other, f"{name}.{place}" if name else str(place)):
-                return found
-    return name, recorded, replayed
-
-
-def _changed_frame(tick: LoggedTick, frames: Sequence[PmuFrame]) -> tuple[str, object, object] | None:
-    """The first frame that is not what was received: its bytes, or what the log says they mean, were changed."""
-    if len(frames) != len(tick.frames):
-        return "frame", f"{len(tick.frames)} frames", f"{len(frames)} of them readable"
-    for logged, read in zip(tick.frames, frames, strict=True):
-        if chk(logged.wire):
-            return "frame", f"{logged.name} {logged.wire.hex()}", "CHK does not hold"
-        if not identical(logged._replace(tick_ns=0), read):
-            return "frame", f"{logged.name} {logged.time_ns}", "decodes otherwise"
-    return None
+    def _difference(self, group: TickMessages, now: Tick) -> Difference | None:
+        """Of a tick from its record in the log; with changed settings of no more than what was decided."""
+        is_same = not self.result.changes
+        found = changed_memory(group, now.memory) if is_same else None
+        if found is None and same_bytes(group, now, self._instances, frames=is_same):
+            return None
+        tick = logged_tick(group)
+        found = found or (changed_frame(tick, now.frames) if is_same else None) or changed(tick.record, now.record)
+        return None if found is None else Difference(group.tick_ns, *found, self._before, tick.frames, tick.orders)

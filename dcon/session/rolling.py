@@ -20,6 +20,7 @@ from types import TracebackType
 from dcon.core.values import Event
 from dcon.link.bundle import Entry
 from dcon.session import codec
+from dcon.session.checkpoint import EVERY_S
 from dcon.session.head import Head
 from dcon.session.parts import SESSION, part_path
 from dcon.session.writer import SessionWriter
@@ -29,6 +30,8 @@ from pmutools.timebase import NS
 LOG = logging.getLogger(__name__)
 RETRY_NS = 10 * NS
 """Of ticks: how long to wait before trying a new part after a refusal."""
+PATIENCE_NS = 2 * EVERY_S * NS
+"""Of ticks: how long a part that is to end waits for the next checkpoint, where it has had one."""
 LOG_SUBJECT = "log"
 """Subject of events that the log adds to a tick: no business of the controller, nor of a replay."""
 
@@ -45,8 +48,8 @@ class RollingWriter:
     head
         As for :class:`SessionWriter`; it goes into every part, with the newest configurations.
     max_mb, max_minutes
-        A part that has so many bytes (in millions, compressed) or spans so much of the ticks' time is ended, between
-        two ticks; infinity for no limit.
+        A part that has so many bytes (in millions, compressed) or spans so much of the ticks' time is ended, before
+        the next tick that is logged with a checkpoint: the next part can be replayed alone. Infinity for no limit.
     session_id
         What the parts have in common; unless given, one that no other session has.
     parts
@@ -78,6 +81,10 @@ class RollingWriter:
         self._log: SessionWriter | None = None
         self._begun_ns = 0
         """First tick of the part."""
+        self._checkpoint_ns: int | None = None
+        """Last tick with one, of the part."""
+        self._is_full = False
+        """The part ends as soon as the next may begin."""
         self._is_made = False
         """The part was not there before: it is ours to take away."""
         self._written = self._open_ticks = 0
@@ -93,6 +100,9 @@ class RollingWriter:
 
     def write(self, entries: Sequence[Entry], tick_ns: int) -> None:
         """Log the entries of the tick at ``tick_ns``, or count it."""
+        is_checkpoint = any(entry.message == "Checkpoint" for entry in entries)
+        if self._log is not None and self._is_full and (is_checkpoint or self._has_waited(tick_ns)):
+            self._end_part(self._log, tick_ns)
         log = self._log or self._next_part(tick_ns)
         if log is None:
             self._count(1)
@@ -110,10 +120,13 @@ class RollingWriter:
             self._flushed()
         if not self._written:
             self._begun_ns = tick_ns
+        if is_checkpoint:
+            self._checkpoint_ns = tick_ns
         self._written += 1
         self._open_ticks += 1
-        if log.size >= self._max_bytes or abs(tick_ns - self._begun_ns) >= self._max_ns:
-            self._end_part(log, tick_ns)  # the next is begun with the next tick: one piece of work at a time
+        self._is_full = log.size >= self._max_bytes or abs(tick_ns - self._begun_ns) >= self._max_ns
+        if self._is_full and self._checkpoint_ns is None:
+            self._end_part(log, tick_ns)  # there is none to wait for
 
     def config(self, name: str, frame: bytes, time_ns: int) -> None:
         """Attach a configuration frame that came at ``time_ns``; parts to come begin with it."""
@@ -161,6 +174,10 @@ class RollingWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
 
+    def _has_waited(self, tick_ns: int) -> bool:
+        """No checkpoint has come for a part to end with."""
+        return self._checkpoint_ns is None or abs(tick_ns - self._checkpoint_ns) >= PATIENCE_NS
+
     def _end_part(self, log: SessionWriter, now_ns: int) -> None:
         """Close the part, index and all; where there is no room for its index, it stays whole without."""
         try:
@@ -190,6 +207,7 @@ class RollingWriter:
         self.parts.append(part_path(self.path, number))
         self._is_made = not os.path.lexists(self.parts[-1])
         self._written = self._open_ticks = 0
+        self._checkpoint_ns, self._is_full = None, False
         metadata = {**self._head.metadata, **head}
         self._log = SessionWriter(self.parts[-1], replace(self._head, metadata=metadata))
         for name, (frame, time_ns) in self._configs.items():

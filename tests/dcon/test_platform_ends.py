@@ -84,6 +84,8 @@ def test_a_full_disk_does_not_stop_the_controller(
     assert max(made.steps_mw()) <= SLEW_MW_PER_S / 60 + 1e-9
     result = replay(made.path)
     assert result.different == 0 and result.stopped.startswith("the log lost something before tick")
+    (gap,) = result.gaps  # which ends with the next checkpoint
+    assert gap.passed and gap.ticks < 5 * 60 and result.ticks + gap.ticks == len(logged)
 
 
 def test_a_log_that_cannot_be_opened(bench: Make, tmp_path: Path) -> None:
