@@ -6,7 +6,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,11 +74,12 @@ def command(
         return duration is not None and bool(begun) and time.time_ns() >= begun[0] + round(duration * NS)
 
     with _folder(run_dir or settings.platform.run_dir) as folder:
+        before = _sessions_in(folder)
         commands = _commands(settings, ini, folder, flags, timed)
         household = Household(folder, commands, Notifier(), is_over)
         with household.stopped_by_signals(), log_in_thread():  # who looks after others waits for no reader of stderr
             outcome = household.run()
-    summary = _summary(outcome.said)
+    summary = _summary(outcome.said, before)
     missing = summary.get("unlogged_ticks", 0)
     restarts = sum(outcome.restarts.values())
     if as_json:
@@ -87,21 +88,48 @@ def command(
         told = ", ".join(f"{name} {count} times" for name, count in outcome.restarts.items())
         talk.complain(f"started again: {told}")
     if missing:
-        talk.complain(f"{missing} ticks are missing in the session log")
+        logs = "session log" if len(outcome.said.get("platform", ())) < 2 else "session logs"
+        talk.complain(f"{missing} ticks are missing in the {logs}")
     if household.stopping:
         return Exit.INTERRUPTED
     return Exit.INCOMPLETE if (restarts or missing) and not outcome.code else outcome.code
 
 
-def _summary(said: Mapping[str, str]) -> dict[str, Any]:
-    """The controller's summary, with what the server knows of the log.
+def _sessions_in(folder: Path) -> frozenset[int]:
+    """Sessions that a server has recorded there: those of an earlier run, when this one begins."""
+    from dcon.server.state import load
 
-    Both count ticks that are missing: the controller those that the server never confirmed, the server those that the
-    disk did not take and those that the controller could not keep for it. Some are both, so the larger number counts.
+    state = load(folder)
+    return frozenset() if state is None else frozenset((state.session, *(session for session, _ in state.earlier)))
+
+
+def _summary(said: Mapping[str, Sequence[str]], before: Collection[int]) -> dict[str, Any]:
+    """The last controller's summary, with what is known of the logs of all sessions but those from ``before``.
+
+    Controller and server both count ticks that are missing in a session: the controller those that the server never
+    confirmed, the server those that the disk did not take and those that the controller could not keep for it. Some are
+    both, so the larger number counts.
     """
-    summary, log = (json.loads(said.get(name) or "{}") for name in ("platform", "server"))
-    missing = max(told.get("unlogged_ticks", 0) for told in (summary, log))
-    return {**summary, "unlogged_ticks": missing, "log_parts": log.get("log_parts", [])}
+    controllers, servers = ([_parsed(text) for text in said.get(name, ())] for name in ("platform", "server"))
+    counts = [(told.get("session", 0), told.get("unlogged_ticks", 0)) for told in controllers]
+    counts += [
+        (int(session), ticks) for told in servers for session, ticks in told.get("unlogged_by_session", {}).items()
+    ]
+    missing: dict[int, int] = {}
+    for session, ticks in counts:
+        if session not in before:
+            missing[session] = max(missing.get(session, 0), ticks)
+    last, log = (told[-1] if told else {} for told in (controllers, servers))
+    return {**last, "unlogged_ticks": sum(missing.values()), "log_parts": log.get("log_parts", [])}
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    """Nothing of a process that was killed while it spoke."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _commands(

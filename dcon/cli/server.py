@@ -50,9 +50,13 @@ def command(ini: str, run_dir: str, log: str | None, as_json: bool, quiet: bool,
         server.run()
     report = server.report
     if as_json:
-        click.echo(json.dumps({"log_parts": report.paths, "unlogged_ticks": report.unlogged}))
+        by_session = dict(report.lacking)
+        said = {"log_parts": report.paths, "unlogged_ticks": report.unlogged, "unlogged_by_session": by_session}
+        click.echo(json.dumps(said))
     if report.file:
         talk.say(f"session log {report.file}, {len(report.paths)} part(s), {report.unlogged} ticks are missing")
     elif report.unlogged:
         talk.complain(f"no session log: {report.unlogged} ticks are missing")
+    if earlier := sum(ticks for _, ticks in report.lacking) - report.unlogged:
+        talk.say(f"{earlier} ticks are missing in earlier sessions of this run folder")
     return Exit.INCOMPLETE if report.unlogged else Exit.DONE

@@ -152,10 +152,10 @@ class ShippedLog:
     parts: tuple[str, ...] = ()
 
     def __init__(self, head: Head, settings: Settings, server: Path, news: RunNews, clock: Clock) -> None:
-        session = random.getrandbits(32)  # tells this session from the one before, to a server that was there
+        self.session = random.getrandbits(32)  # tells it from the one before, to a server that was there
         limits = settings.log
         ring = Ring(round(limits.backfill_s * 1e9), round(limits.backfill_mb * 1e6))
-        self._shipping = Shipping(server, Shipper(session, head.pieces(session), ring))
+        self._shipping = Shipping(server, Shipper(self.session, head.pieces(self.session), ring))
         self._news, self._clock = news, clock
         self._shown: Watchdog | None = None
 

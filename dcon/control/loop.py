@@ -91,6 +91,8 @@ class Summary:
     """Configurations that a newer one of their PMU replaced before they were taken."""
     unsent: int = 0
     """Commands that the system refused to send, or that nobody listened to."""
+    session: int = 0
+    """Number of the session at the server; 0 where this process writes the log."""
     unlogged_ticks: int = 0
     """Ticks that the log had no room for."""
     log_parts: list[str] = field(default_factory=list)
@@ -285,7 +287,7 @@ class Platform:
         summary.crowded = counts.crowded + self._waiting.crowded
         summary.overtaken_configs = self._waiting.overtaken
         summary.unsent = self.ends.command.failed
-        summary.unlogged_ticks = log.unlogged_ticks
+        summary.session, summary.unlogged_ticks = log.session, log.unlogged_ticks
         summary.log_parts = list(map(str, log.parts))
 
 

@@ -77,6 +77,9 @@ class Log(Protocol):
     def close(self) -> None:
         """All ticks have been logged; the one call that may take its time."""
 
+    session: int
+    """What a server knows it by; 0 where there is none."""
+
     @property
     def unlogged_ticks(self) -> int: ...
 

@@ -36,6 +36,8 @@ ROUND_S = 1.0
 """The longest between two rounds: so often systemd is told that all is well."""
 USAGE = 2
 """Exit code of a process that was set up wrongly: it would be the same again."""
+MOST_SAID = 256
+"""Lives of one process whose last words are kept."""
 DONE = (0, 3)
 """Exit codes of a controller whose time is over."""
 
@@ -69,8 +71,8 @@ class Outcome:
     code: int = 0
     """Exit code of the controller that was the last."""
     restarts: dict[str, int] = field(default_factory=dict)
-    said: dict[str, str] = field(default_factory=dict)
-    """What the last controller and the last server wrote to their standard output, by name."""
+    said: dict[str, list[str]] = field(default_factory=dict)
+    """What each controller and each server wrote to its standard output, by name; one that was killed wrote nothing."""
 
 
 @dataclass
@@ -272,7 +274,9 @@ class Household:
         assert process is not None
         code = process.wait()
         if process.stdout is not None:
-            self.outcome.said[each.member.name] = process.stdout.read()
+            said = self.outcome.said.setdefault(each.member.name, [])
+            said.append(process.stdout.read())
+            del said[:-MOST_SAID]
             process.stdout.close()
         self._poll.unregister(each.pidfd)
         os.close(each.pidfd)

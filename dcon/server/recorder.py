@@ -19,6 +19,8 @@ from pmutools.errors import SourceError
 from pmutools.schema.log_writer import seal
 
 LOG = logging.getLogger(__name__)
+EARLIER = 256
+"""Sessions that lack ticks and are remembered; the oldest of more are counted as one."""
 
 
 class Report(NamedTuple):
@@ -35,6 +37,8 @@ class Report(NamedTuple):
     """Times that something was missing."""
     unlogged: int = 0
     """Ticks that are missing in the session."""
+    lacking: tuple[tuple[int, int], ...] = ()
+    """Numbers of sessions that lack ticks, and how many: of earlier ones in this folder, and this."""
     refused: bool = False
     """The system lets nothing be written at present."""
     disk_free_percent: float | None = None
@@ -59,6 +63,7 @@ class Recorder:
         self._senseless = 0
         """Heads that were whole, and said nothing."""
         self._old = states.load(folder)
+        self._earlier = dict(self._old.earlier) if self._old is not None else {}
         self._assembly = Assembly()
         self._key = ""
         self._unlogged_before = 0
@@ -104,6 +109,7 @@ class Recorder:
                 paths=tuple(map(str, writer.parts)),
                 tick_ns=self._safe_ns,
                 unlogged=self._unlogged(writer),
+                lacking=self._lacking(writer),
                 refused=writer.is_refused,
             )
         self._said = self._said._replace(gaps=self.gaps, disk_free_percent=free_percent(Path(self.path).parent))
@@ -119,7 +125,14 @@ class Recorder:
         parts = tuple(map(str, writer.parts))
         session, have, ticks = self._whole
         lost = self._unlogged(writer), writer.missing, writer.reason
-        return State(session or 0, self._key, str(writer.path), have, parts, writer.size, configs, ticks, *lost)
+        earlier = tuple(self._earlier.items())
+        return State(
+            session or 0, self._key, str(writer.path), have, parts, writer.size, configs, ticks, *lost, earlier
+        )
+
+    def _lacking(self, writer: RollingWriter) -> tuple[tuple[int, int], ...]:
+        now = (self._whole.session or 0, self._unlogged(writer))
+        return (*self._earlier.items(), now) if now[1] else tuple(self._earlier.items())
 
     def _unlogged(self, writer: RollingWriter) -> int:
         """Ticks that are missing in the session, those of earlier lives of this process too."""
@@ -134,13 +147,25 @@ class Recorder:
             return
         if self._writer is not None:
             self._writer.close()
+            self._lacks(self._whole.session, self._unlogged(self._writer))
         old, self._old = self._old, None
+        if old is not None and old.session != pieces.session:
+            self._lacks(old.session, old.unlogged)
         if old is not None and old.session == pieces.session and self._seal(old):
             LOG.info("the session goes on in a new part after %s", old.parts[-1] if old.parts else self.path)
             self._open(head, old)
         else:
             self._open(head, self._fresh(pieces.session))
         self.flush()
+
+    def _lacks(self, session: int | None, ticks: int) -> None:
+        """A session is over that lacks so many ticks."""
+        if session is None or not ticks:
+            return
+        self._earlier[session] = ticks
+        while len(self._earlier) > EARLIER:
+            oldest, next_oldest, *_ = self._earlier
+            self._earlier[next_oldest] += self._earlier.pop(oldest)
 
     def _open(self, head: Head, state: State) -> None:
         """Write the log of a session, from its beginning or from where ``state`` says it is."""

@@ -39,6 +39,8 @@ class State(NamedTuple):
     """Of these, the ones of which the log does not say so yet."""
     reason: str = ""
     """Why."""
+    earlier: tuple[tuple[int, int], ...] = ()
+    """Numbers of earlier sessions that lack ticks, and how many."""
 
     @property
     def place(self) -> Place:
@@ -52,12 +54,18 @@ def load(folder: Path) -> State | None:
         values = json.loads((folder / FILE).read_bytes())
         state = State(**values)
         configs = tuple((str(name), bytes.fromhex(frame).hex(), int(at)) for name, frame, at in state.configs)
-        counts = (state.unlogged, state.untold, 0 if state.size is None else state.size)
+        earlier = tuple((session, ticks) for session, ticks in state.earlier)
+        counts = (
+            *(number for pair in earlier for number in pair),
+            state.unlogged,
+            state.untold,
+            0 if state.size is None else state.size,
+        )
         numbers = (state.session, state.have, state.ticks, *counts)
         texts = (state.key, state.path, state.reason)
         if not (all(type(number) is int for number in numbers) and all(isinstance(text, str) for text in texts)):
             return None
-        return state._replace(parts=tuple(map(str, state.parts)), configs=configs)
+        return state._replace(parts=tuple(map(str, state.parts)), configs=configs, earlier=earlier)
     except (OSError, ValueError, TypeError):
         return None
 

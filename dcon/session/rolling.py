@@ -58,6 +58,9 @@ class RollingWriter:
         The first part is begun by the first tick, and tried again where it cannot be written, as any other.
     """
 
+    session = 0
+    """No server has it in its charge."""
+
     def __init__(
         self,
         path: str | os.PathLike[str],

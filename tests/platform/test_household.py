@@ -121,7 +121,7 @@ def test_a_controller_whose_time_is_over_ends_the_run_with_its_code_and_its_word
     house = House(tmp_path)
     house.lives["platform"] = [(0.3, 3)]
     outcome = house.household.run()
-    assert (outcome.code, outcome.restarts, outcome.said["platform"]) == (3, {}, '{"ticks": 7}\n')
+    assert (outcome.code, outcome.restarts, outcome.said["platform"]) == (3, {}, ['{"ticks": 7}\n'])
     assert house.events("term") == ["server", "watchdog"]
     assert house.is_empty()
 

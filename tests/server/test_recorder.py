@@ -16,7 +16,7 @@ from dcon.link.assembly import Place
 from dcon.link.bundle import Bundle, Entry, Kind, decode
 from dcon.link.shipper import Ring, Shipper
 from dcon.server import state
-from dcon.server.recorder import Recorder
+from dcon.server.recorder import Recorder, Report
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
@@ -25,6 +25,8 @@ from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run
 from pmutools.timebase import NS
+
+EARLIER = b'{"session": 7, "key": "k", "path": "x", "have": 0, "earlier": [[1, "2"]]}'
 
 
 class Line:
@@ -232,7 +234,70 @@ def test_bundles_without_sense_are_a_gap_and_no_harm(tmp_path: Path) -> None:
     same_ticks(SessionReader(tmp_path / "session.mcap"), range(1))
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b"[1]", b'{"session": 7, "key": 1, "path": "x", "have": 0}', b"\xff"])
+def gone(folder: Path, session: int, ticks: int) -> Report:
+    """A session that loses so many ticks on their way; then controller and server are killed."""
+    line = Line(folder, session)
+    line.control.tick()
+    line.move(16)
+    for _ in range(ticks):
+        line.control.tick()
+    line.control.shipper.service(lambda data: True, ticks)
+    line.control.tick()
+    line.move()
+    line.flush()
+    return line.recorder.flush()
+
+
+def test_sessions_that_lack_ticks_are_remembered_whoever_dies(tmp_path: Path) -> None:
+    assert gone(tmp_path, 1, 30).lacking == ((1, 30),)
+    assert gone(tmp_path, 2, 0).lacking == ((1, 30),)
+    report = gone(tmp_path, 3, 12)
+    assert (report.unlogged, report.lacking) == (12, ((1, 30), (3, 12)))
+    kept = states_of(tmp_path)
+    assert (kept.session, kept.unlogged, kept.earlier) == (3, 12, ((1, 30),))
+    line = Line(tmp_path, 4)  # the same server for two sessions
+    line.control.tick()
+    line.move()
+    line.control = FakeControl(tmp_path / "run", 5)
+    line.connect()
+    line.control.tick()
+    line.move()
+    line.flush()
+    assert line.recorder.flush().lacking == ((1, 30), (3, 12))
+
+
+def states_of(folder: Path) -> state.State:
+    found = state.load(folder / "run")
+    assert found is not None
+    return found
+
+
+def test_a_session_that_goes_on_is_counted_once(tmp_path: Path) -> None:
+    line = Line(tmp_path, ring=Ring(600 * NS, 60_000))
+    for _ in range(200):
+        line.control.tick()
+    for _ in range(20):
+        line.move()
+    line.flush()
+    missing = line.recorder.flush().unlogged
+    assert missing > 50
+    line.kill()
+    line.control.tick()
+    line.move()
+    line.flush()
+    assert line.recorder.flush().lacking == ((7, missing),) and states_of(tmp_path).earlier == ()
+
+
+def test_of_very_many_sessions_none_is_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dcon.server.recorder.EARLIER", 3)
+    for session in range(1, 7):
+        report = gone(tmp_path, session, session)
+    assert report.lacking == ((3, 6), (4, 4), (5, 5), (6, 6))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[1]", b'{"session": 7, "key": 1, "path": "x", "have": 0}', b"\xff", EARLIER]
+)
 def test_a_damaged_state_begins_a_new_log(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / state.FILE).write_bytes(content)
