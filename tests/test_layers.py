@@ -35,6 +35,7 @@ LAYERS = [
     ["dcon.settings"],
     ["dcon.effective", "dcon.engine"],
     ["dcon.session"],
+    ["dcon.columns", "dcon.export", "dcon.replay"],
     ["dcon.drivers"],
     ["dcon.sim"],
     # one package a process: they meet in dcon.link only, but for a controller that is alone and receives by itself

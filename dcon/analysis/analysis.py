@@ -15,10 +15,10 @@ import pmutools
 from dcon.analysis import course, numbers
 from dcon.analysis.disturbances import Floats, disturbances
 from dcon.analysis.ringdowns import Comparison, Loop, Ringdown, compare, ringdowns
+from dcon.columns.read import read_columns
+from dcon.columns.tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
 from dcon.core.params import Params
 from dcon.limiter import LIMIT_MW
-from dcon.session.column_tables import MODES, STATES, InstanceColumns, SessionColumns, TickColumns
-from dcon.session.columns import read_columns
 from dcon.session.newer import Newer
 from dcon.session.parts import Part, named_twice, part_of
 from dcon.settings import parse

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcon.analysis.disturbances import Floats
-from dcon.session.column_tables import INSTANCE_STATES, MODES, STATES, UNKNOWN, SessionColumns
+from dcon.columns.tables import INSTANCE_STATES, MODES, STATES, UNKNOWN, SessionColumns
 from dcon.session.rolling import LOG_SUBJECT
 from pmutools.timebase import NS
 

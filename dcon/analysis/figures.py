@@ -14,8 +14,8 @@ from dcon.analysis.course import Stretch
 from dcon.analysis.disturbances import Floats
 from dcon.analysis.numbers import delays_ms
 from dcon.analysis.ringdowns import Comparison, Mode, Ringdown
+from dcon.columns.tables import INSTANCE_STATES, UNKNOWN
 from dcon.core.values import words_of
-from dcon.session.column_tables import INSTANCE_STATES, UNKNOWN
 from pmutools.modal.matrix_pencil import ANALYSIS_HZ, ringdown
 from pmutools.report import theme
 from pmutools.report.figures import (

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dcon.analysis.course import largest
 from dcon.analysis.disturbances import Floats
 from dcon.analysis.ringdowns import SATURATED
-from dcon.session.column_tables import STAMP_SOURCES, STATES, PmuColumns, SessionColumns
+from dcon.columns.tables import STAMP_SOURCES, STATES, PmuColumns, SessionColumns
 from pmutools.c37118.constants import STAT_DATA_ERROR_MASK, Stat
 from pmutools.measure.budget import Row, budget
 from pmutools.measure.histogram import Histogram

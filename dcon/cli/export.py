@@ -7,7 +7,7 @@ import json
 import click
 
 from dcon.cli.spare import spare
-from dcon.session.tables import TABLES
+from dcon.export.tables import TABLES
 from pmutools.cli.shell import Exit, Talk, common
 
 
@@ -25,7 +25,7 @@ def command(sessions: tuple[str, ...], output: str, table: str, as_json: bool, q
 
     Exit code 3 says that part of the log is missing or could not be read.
     """
-    from dcon.session.export import export
+    from dcon.export.export import export
 
     talk = Talk(quiet, verbose)
     spare(output, sessions)

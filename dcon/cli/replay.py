@@ -19,7 +19,7 @@ from pmutools.timebase import NS
 
 if TYPE_CHECKING:
     from dcon.core.values import Record
-    from dcon.session.replay import Driven, Observer
+    from dcon.replay.replay import Driven, Observer
 
 TOLD_TICKS = 3600
 
@@ -52,7 +52,7 @@ def command(
     Exit code 3 says that something came out otherwise (without --set), or that the log could not be replayed whole.
     With --set the answer is what the controller would have commanded, not what the grid would have done.
     """
-    from dcon.session.replay import NOT_THE_GRID, replay
+    from dcon.replay.replay import NOT_THE_GRID, replay
 
     talk = Talk(quiet, verbose)
     if out is not None:
@@ -98,7 +98,7 @@ def _commands(out: Path | None) -> Iterator[Observer]:
     if out is None:
         yield lambda recorded, now: None
         return
-    from dcon.session.replay import Driven
+    from dcon.replay.replay import Driven
     from pmutools.formats.output import whole
 
     columns = [f"{which}_{name}" for name in Driven._fields for which in ("recorded", "replayed")]

@@ -1,4 +1,4 @@
-"""Session logs: what a controller run was given, decided and took, in one MCAP file.
+"""Session logs: what a controller run was given, decided and took, in one MCAP file. They are written and read here.
 
-:mod:`.log` writes and reads them, :mod:`.export` makes tables of them.
+What is made of them is elsewhere: :mod:`dcon.replay`, :mod:`dcon.export`, :mod:`dcon.columns`.
 """

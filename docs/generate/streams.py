@@ -8,7 +8,7 @@ from enum import StrEnum
 from types import SimpleNamespace
 from typing import Any
 
-from dcon.session.tables import TABLES
+from dcon.export.tables import TABLES
 from generate.markdown import attribute_docs, code, fenced, first_sentence, mermaid, prose, table
 from generate.structure import ROOT, constant
 from pmutools.c37118.batch import Batch

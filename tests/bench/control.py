@@ -12,8 +12,8 @@ from pathlib import Path
 from bench.table import Budget, Row
 
 from dcon.engine import Engine
+from dcon.replay.replay import replay
 from dcon.session.reader import LoggedTick, SessionReader
-from dcon.session.replay import replay
 from dcon.settings import parse
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

@@ -19,8 +19,8 @@ from bench.host import Look, growth_mib, rss_kib, steal_s
 from bench.waking import FLEET, stranger
 from support.running import PROCESSES, Running, flood
 
+from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 from pmutools.timebase import NS
 
 GROWTH_MIB = 4.0

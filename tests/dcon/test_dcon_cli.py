@@ -131,7 +131,7 @@ def test_a_platform_alone_says_what_nobody_tells_it(
 def test_an_error_that_nobody_expected_is_one_line_too(
     session: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
-    monkeypatch.setattr("dcon.session.replay.replay", lambda *args: 1 // 0)
+    monkeypatch.setattr("dcon.replay.replay.replay", lambda *args: 1 // 0)
     assert run(dcon(), ["replay", str(session)]) == 1
     err = capsys.readouterr().err
     assert err == "dcon: internal error: ZeroDivisionError: integer division or modulo by zero (--debug shows where)\n"

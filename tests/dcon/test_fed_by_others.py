@@ -29,8 +29,8 @@ from support.swing import Streams
 
 from dcon.cli import dcon
 from dcon.core.values import InstanceState
+from dcon.replay.replay import replay
 from dcon.session.reader import LoggedTick, SessionReader
-from dcon.session.replay import replay
 from pmutools.c37118 import Format, StreamConfig, decode_data, decode_prefix, encode_data
 from pmutools.c37118.config import encode_config
 from pmutools.c37118.frames import wire_values

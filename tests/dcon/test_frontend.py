@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.swing import START_NS, some
 
 from dcon.frontend import bind
-from dcon.session.difference import identical
+from dcon.replay.difference import identical
 from pmutools.c37118 import Frame, PhasorChannel, StreamConfig
 from pmutools.c37118.checksum import sealed
 from pmutools.errors import SettingsError

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dcon.session.export import export
+from dcon.export.export import export
 from dcon.session.reader import SessionReader
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate

@@ -11,8 +11,8 @@ import pytest
 from support.sessions import random_ticks, write_session
 
 from dcon.cli import dcon
-from dcon.session import export as export_module
-from dcon.session.export import export
+from dcon.export import export as export_module
+from dcon.export.export import export
 from pmutools.cli.shell import run
 from pmutools.errors import SourceError
 from pmutools.formats.output import whole

@@ -13,7 +13,7 @@ from support.virtual_platform import Bench, Item, stream, virtual_platform
 from dcon.core.values import SystemState
 from dcon.engine import Engine
 from dcon.limiter import SLEW_MW_PER_S
-from dcon.session.replay import replay
+from dcon.replay.replay import replay
 from pmutools.errors import SourceError
 
 Make = Callable[..., Bench]

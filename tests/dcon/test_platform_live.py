@@ -27,8 +27,8 @@ from dcon.cli import dcon
 from dcon.core.values import InstanceState, Mode, SystemState
 from dcon.limiter import SLEW_MW_PER_S
 from dcon.link.command import CommandOut
+from dcon.replay.replay import replay
 from dcon.session.reader import LoggedTick, SessionReader
-from dcon.session.replay import replay
 from pmutools.cli.shell import run
 from pmutools.timebase import NS, format_utc
 

@@ -17,7 +17,7 @@ from dcon.control.orders import parse_order
 from dcon.control.waiting import CONFIGS
 from dcon.core.values import SystemState
 from dcon.limiter import SLEW_MW_PER_S
-from dcon.session.difference import identical
+from dcon.replay.difference import identical
 from dcon.session.reader import SessionReader
 from pmutools.c37118 import StreamConfig
 from pmutools.errors import SettingsError

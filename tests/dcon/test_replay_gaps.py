@@ -17,10 +17,10 @@ from dcon.cli import dcon
 from dcon.core.values import Record
 from dcon.link.bundle import Entry, decode
 from dcon.link.shipper import Ring, Shipper
+from dcon.replay.replay import Gap, replay
 from dcon.server.recorder import Recorder
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
-from dcon.session.replay import Gap, replay
 from dcon.session.rolling import RollingWriter
 from pmutools.cli.shell import run
 from pmutools.schema.descriptors import message_class

@@ -24,11 +24,11 @@ from support.sessions import (
 )
 from support.virtual_platform import stream, virtual_platform
 
+from dcon.columns import read as columns_module
+from dcon.columns.read import read_columns
+from dcon.columns.tables import INSTANCE_STATES, MODES, STAMP_SOURCES, STATES, UNKNOWN, SessionColumns
 from dcon.link.bundle import Entry
-from dcon.session import columns as columns_module
 from dcon.session.codec import Watchdog
-from dcon.session.column_tables import INSTANCE_STATES, MODES, STAMP_SOURCES, STATES, UNKNOWN, SessionColumns
-from dcon.session.columns import read_columns
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.parts import Paths

@@ -28,10 +28,10 @@ from support.sessions import (
     write_session,
 )
 
-from dcon.session import export as export_module
+from dcon.export import export as export_module
+from dcon.export.export import export
+from dcon.export.tables import TABLES
 from dcon.session.codec import Watchdog
-from dcon.session.export import export
-from dcon.session.tables import TABLES
 from pmutools.errors import SettingsError, SourceError
 from pmutools.schema.messages import MESSAGES
 

@@ -31,7 +31,7 @@ from support.sessions import (
 )
 
 from dcon.cli import dcon
-from dcon.session.export import export
+from dcon.export.export import export
 from dcon.session.head import Head
 from dcon.session.parts import part_path
 from dcon.session.reader import LoggedTick, SessionReader

@@ -13,12 +13,12 @@ from support.sessions import log_tick
 from dcon.cli import dcon
 from dcon.core.values import Event, Order, Pdci, Record, Surroundings
 from dcon.engine import Engine
+from dcon.replay.difference import identical
+from dcon.replay.replay import replay
 from dcon.session import codec
 from dcon.session.defaults import former
-from dcon.session.difference import identical
 from dcon.session.head import Head
 from dcon.session.reader import LoggedTick, SessionReader
-from dcon.session.replay import replay
 from dcon.session.writer import SessionWriter
 from dcon.settings import parse
 from dcon.sim.plan import Plan

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from dcon.cli import dcon
+from dcon.columns.read import read_columns
 from dcon.core.differentiator import coefficients, response
 from dcon.core.params import RATES
 from dcon.core.values import Event
 from dcon.limiter import MW_PER_V
-from dcon.session.columns import read_columns
+from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 from dcon.sim.delays import split
 from dcon.sim.judging import why_unjudged
 from dcon.sim.plan import Plan

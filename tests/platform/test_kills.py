@@ -19,8 +19,8 @@ import pytest
 from support.running import PROCESSES, Running
 
 from dcon.link.command import CommandOut
+from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 
 pytestmark = [
     pytest.mark.alone,

@@ -12,8 +12,8 @@ import pytest
 from support.iio import counts, iio_device, volts
 from support.running import Running, command_line, descendants
 
+from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 
 pytestmark = [
     pytest.mark.alone,

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from support.running import Running
 
+from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 
 pytestmark = [
     pytest.mark.alone,

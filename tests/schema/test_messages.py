@@ -110,7 +110,7 @@ def test_names_of_schemas() -> None:
 
 def test_importing_the_schema_imports_neither_protobuf_nor_mcap() -> None:
     code = (
-        "import sys, pmutools.schema.pmu_log, dcon.session.export;"
+        "import sys, pmutools.schema.pmu_log, dcon.export.export;"
         "print([m for m in ('google.protobuf', 'mcap', 'zstandard', 'pyarrow') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)

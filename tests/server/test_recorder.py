@@ -15,12 +15,12 @@ from support.shipped import FakeControl, recorder_in, same_ticks, tick_at
 from dcon.link.assembly import Place
 from dcon.link.bundle import Bundle, Entry, Kind, decode
 from dcon.link.shipper import Ring, Shipper
+from dcon.replay.replay import replay
 from dcon.server import state
 from dcon.server.recorder import Recorder, Report
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 from dcon.sim.plan import Plan
 from dcon.sim.simulate import simulate
 from pmutools.cli.shell import run

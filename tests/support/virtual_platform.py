@@ -17,9 +17,9 @@ from dcon.control.orders import TimedOrder, parse_order
 from dcon.control.ports import Ends
 from dcon.core.values import Record
 from dcon.front.receiving import Reception
+from dcon.replay.replay import replay
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
-from dcon.session.replay import replay
 from dcon.session.rolling import RollingWriter
 from pmutools.c37118 import Demux, Loss, Message, StreamConfig
 from pmutools.c37118.config import encode_config

@@ -1,4 +1,4 @@
-"""The tables of a session as columns: what :func:`dcon.session.columns.read_columns` gives."""
+"""The tables of a session as columns: what :func:`dcon.columns.read.read_columns` gives."""
 
 from __future__ import annotations
 

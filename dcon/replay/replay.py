@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 import pmutools
 from dcon.core.values import Record
 from dcon.engine import Engine, Tick
+from dcon.replay.difference import Difference, changed, changed_frame, changed_memory, same_bytes
 from dcon.session import codec
 from dcon.session.checkpoint import decode_checkpoint
 from dcon.session.defaults import former
-from dcon.session.difference import Difference, changed, changed_frame, changed_memory, same_bytes
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
 from dcon.session.reader import TICK_MESSAGES, SessionReader, TickMessages, logged_tick

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dcon.session.column_tables import UNKNOWN, Array, Codes, Ints
+from dcon.columns.tables import UNKNOWN, Array, Codes, Ints
 from pmutools.schema.columns import Texts
 
 

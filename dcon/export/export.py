@@ -11,10 +11,10 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from dcon.export.tables import TABLES, Column, Row, Table
 from dcon.session.newer import Newer, newer_in
 from dcon.session.parts import Paths
 from dcon.session.reader import SessionReader
-from dcon.session.tables import TABLES, Column, Row, Table
 from pmutools.errors import SettingsError, SourceError
 from pmutools.formats.output import whole
 from pmutools.schema.log_reader import Damage

@@ -19,9 +19,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from dcon.session.blocks import Blocks, codes_of, looked_up, named, places
-from dcon.session.codec import Watchdog, decode_flag, decode_order
-from dcon.session.column_tables import (
+from dcon.columns.blocks import Blocks, codes_of, looked_up, named, places
+from dcon.columns.tables import (
     INSTANCE_STATES,
     MODES,
     STAMP_SOURCES,
@@ -37,6 +36,7 @@ from dcon.session.column_tables import (
     SessionColumns,
     TickColumns,
 )
+from dcon.session.codec import Watchdog, decode_flag, decode_order
 from dcon.session.newer import newer_in
 from dcon.session.parts import Part, Paths, lost
 from dcon.session.reader import SessionReader

@@ -1,0 +1,1 @@
+"""A session's log as numpy columns: what looks at whole sessions afterwards begins with them."""

@@ -1,0 +1,1 @@
+"""A session's log through the engine once more, and where it comes out otherwise."""
