@@ -13,10 +13,13 @@ from dcon.link import paths
 from dcon.link.beats import LoopName, LoopState
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
+from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 ROUND_S = 0.1
 """Longest wait of a loop."""
+COUNTS_NS = NS
+"""Counts are told so often, where they have changed."""
 
 
 class Aide(threading.Thread):
@@ -29,12 +32,17 @@ class Aide(threading.Thread):
         self._stopped = threading.Event()
         self.failure = ""
         """Why the loop has ended by itself."""
+        self._untold = 0
+        self._counted: dict[str, int] = {}
+        """The counts that the control process knows."""
+        self._counted_ns = 0
 
     def run(self) -> None:
         try:
             while not self._stopped.is_set():
                 self.round()
                 self._pulse.beat(time.monotonic_ns())
+                self._tell_counts(time.monotonic_ns())
         except Exception as error:  # the edge of the loop: its beats stop, and the process ends
             LOG.exception("the %s loop failed", self.name)
             self.failure = f"{type(error).__name__}: {error}"
@@ -56,6 +64,20 @@ class Aide(threading.Thread):
         self._watchdog.close()
         self._control.close()
 
-    def tell(self, news: dict[str, Any]) -> None:
-        """To the control process."""
-        self._control.send(json.dumps(news, allow_nan=False).encode())
+    def tell(self, news: dict[str, Any]) -> bool:
+        """To the control process; whether it was taken."""
+        taken = self._control.send(json.dumps(news, allow_nan=False).encode())
+        self._untold += not taken
+        return taken
+
+    def counts(self) -> dict[str, int]:
+        """What this loop counts (:data:`dcon.link.counts.COUNTS`)."""
+        return {"untold": self._untold}
+
+    def _tell_counts(self, now_ns: int) -> None:
+        if now_ns - self._counted_ns < COUNTS_NS:
+            return
+        self._counted_ns = now_ns
+        counts = {name: value for name, value in self.counts().items() if value}
+        if counts != self._counted and self.tell({"kind": "counts", "loop": self.name, "counts": counts}):
+            self._counted = counts

@@ -54,6 +54,13 @@ class PdciAide(Aide):
             said["scheduled_mw"] = None
         self.tell({"kind": "pdci", **said})
 
+    def counts(self) -> dict[str, int]:
+        return super().counts() | {
+            "line_foreign": self.foreign,
+            "line_refused": sum(self.inbox.refused.values()),
+            "line_failed": 0 if self._device is None else self._device.failed,
+        }
+
     def _datagrams(self, sock: socket.socket) -> list[bytes]:
         found: list[bytes] = []
         with suppress(OSError):

@@ -44,7 +44,7 @@ class OrderGate:
         floor_ns = utc_ns if last is None else 0
         self.verifier = Verifier(operators, window_ns=round(window_s * NS), last=last, floor_ns=floor_ns)
         self._refusals = RefusalLog()
-        self.accepted = self.refused = 0
+        self.refused = 0
         self.malformed = 0
         """Datagrams that are not even ``{"kind": "signed", ...}``."""
 
@@ -68,7 +68,6 @@ class OrderGate:
             told = self._refusals.order(found, signed, now_ns)
             news = None if told is None else _order(told)
             return Passed(news, {"digest": digest(signed), "refused": found.reason}, reply_to)
-        self.accepted += 1
         if not save_sequences(self._folder, self.verifier.last):
             LOG.warning("%s: cannot be written", self._folder / SEQUENCES)
             with suppress(OSError):  # better none than one that is behind

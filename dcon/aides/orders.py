@@ -44,6 +44,11 @@ class GuiAide(Aide):
         for path, said in replies:
             self._reply(Path(path), said)
 
+    def counts(self) -> dict[str, int]:
+        gate = self.gate
+        own = {"orders_refused": gate.refused, "orders_malformed": gate.malformed, "orders_lost": self.handing.lost}
+        return super().counts() | own
+
     def _reply(self, where: Path, reply: dict[str, Any]) -> None:
         """To a name in the run folder only: who writes to this loop must not have it write elsewhere."""
         if where.name and where.parent.resolve() == self._run_dir:

@@ -164,6 +164,8 @@ def _text(status: dict[str, Any]) -> str:
     watchdog = [] if status["watchdog"] is None else [relays_line(status["watchdog"])]
     if status.get("state") is None:
         return "\n".join([_line(status), *watchdog])
+    from dcon.link.counts import words
+
     log, is_old = status["log"], not status["controller_connected"]
     was, last = ("was ", "last known: ") if is_old else ("", "")
     lines = [
@@ -183,6 +185,8 @@ def _text(status: dict[str, Any]) -> str:
     for flag in status["flags"]:
         state = f"{was}up" if flag["up"] else "latched"
         lines.append(f"  {state:<8} {flag['name']} {flag['subject']}: {flag['text']}")
+    if counted := words(status["counts"] or {}):
+        lines.append(f"not taken: {counted}")
     disk = "" if log["disk_free_percent"] is None else f", disk {log['disk_free_percent']:.0f} % free"
     lines.append(f"log {log['file'] or 'none'}, {_lag(status)}, {log['unlogged_ticks']} ticks missing{disk}")
     return "\n".join(lines)

@@ -82,8 +82,12 @@ def command(
 
 
 def _told(summary: Summary, settings: Settings, talk: Talk, *, stopped: bool) -> int:
+    from dcon.link.counts import words
+
     where = f"; session log {summary.log_parts[0]}" if summary.log_parts else ""
     talk.say(f"{summary.ticks} ticks, {summary.frames} frames, ended {summary.final_state}{where}")
+    if counted := words(summary.counts):
+        talk.say(f"not taken: {counted}")
     if len(summary.log_parts) > 1:
         talk.say(f"in {len(summary.log_parts)} parts, the last {summary.log_parts[-1]}")
     if summary.unlogged_ticks:

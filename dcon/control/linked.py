@@ -9,10 +9,10 @@ import logging
 import random
 import socket
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from dcon.control.news import Heard, hear, is_there, surroundings, watchdog_of
+from dcon.control.news import Heard, counted, hear, is_there, surroundings, watchdog_of
 from dcon.control.ports import Ends, Told
 from dcon.core.values import Order
 from dcon.limiter import MW_PER_V
@@ -141,9 +141,13 @@ class RunNews:
         around = surroundings(self.heard, now_ns, self._command.sent_ns)
         return Told(orders, around, self._children.trouble())
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        return counted(self.heard)
+
     def close(self) -> None:
-        paths.release(self._sock)
         self._children.close()
+        paths.release(self._sock)  # the last: who finds it free finds the children's ports free too
 
 
 class ShippedLog:

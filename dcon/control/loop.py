@@ -27,6 +27,7 @@ from dcon.core.system import ENGAGED, Trigger
 from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
 from dcon.link.command import RELAYS
+from dcon.link.counts import total
 from dcon.link.crossing import Failure, Item, PmuFrameIn
 from dcon.session import checkpoint
 from dcon.session.codec import Timing
@@ -38,12 +39,15 @@ from pmutools.clock import Clock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError, SourceError, WireError
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.realtime import go_realtime
+from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
 SPIN_NS = 200_000
 EARLY_NS = 2_000_000
 """So long before a tick, what is there already is taken: the tick itself has only to take what came since."""
 CLOCK_CHECK_TICKS = 60
+COUNTS_NS = NS
+"""What was counted is logged so often."""
 CATCH_UP_S = 1
 """Ticks missed for longer are left out: whatever they would have held up has gone wrong by then."""
 TOLD = 10
@@ -75,24 +79,10 @@ class Summary:
     """Ticks left out, after a pause of the machine or a step of UTC."""
     clock_steps: int = 0
     frames: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    """What did not become what it was sent for (:data:`dcon.link.counts.COUNTS`)."""
     unread: dict[str, int] = field(default_factory=dict)
-    foreign: int = 0
-    """Frames that no PMU of the settings sends: another IDCODE, or another source."""
-    undecodable: int = 0
-    """Runs of bytes that were no frame, and frames of a configuration that is too long to be handed on."""
-    own_drops: int = 0
-    """Datagrams that this machine's full receive buffers have lost."""
-    crowded: int = 0
-    """Frames that came in a flood, or while the loop stood still, and found no room to wait; those of a PMU whose
-    configuration had to."""
-    unreadable_yet: int = 0
-    """Frames that came more than a second before the first configuration of their PMU."""
-    overtaken_configs: int = 0
-    """Configurations that a newer one of their PMU replaced before they were taken."""
-    unsent: int = 0
-    """Commands that the system refused to send, or that nobody listened to."""
-    session: int = 0
-    """Number of the session at the server; 0 where this process writes the log."""
+    """Those of the counts, by PMU."""
     unlogged_ticks: int = 0
     """Ticks that the log had no room for."""
     log_parts: list[str] = field(default_factory=list)
@@ -125,6 +115,7 @@ class Platform:
         self._unusable = Counter[str]()
         self._waiting = Waiting()
         self._configs: list[tuple[str, bytes, int]] = []
+        self._counted_ns = 0
 
     def stop(self) -> None:
         """Ask for the end of :meth:`run`, from a signal handler too."""
@@ -237,10 +228,24 @@ class Platform:
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
         names, record = self.settings.params.instance_names, tick.record
-        memory = tick.memory if checkpoint.is_due(self.summary.ticks, self.settings.params.tick_hz) else None
-        given = (names, record, tick.readings, orders)
-        entries = tick_entries(*given, timing=timing, surroundings=tick.surroundings, memory=memory)
+        counts = None
+        if record.tick_ns - self._counted_ns >= COUNTS_NS:
+            self._counted_ns, counts = record.tick_ns, self._counts()
+        entries = tick_entries(
+            names, record, tick.readings, orders, timing=timing, counts=counts, surroundings=tick.surroundings
+        )
         log.write(entries, record.tick_ns)
+
+    def _counts(self) -> dict[str, int]:
+        """What was counted by now, here and by who tells this loop."""
+        ends, waiting = self.ends, self._waiting
+        own = {
+            "crowded": waiting.crowded,
+            "overtaken_configs": waiting.overtaken,
+            "unread": sum(self.engine.unread.values()),
+            "unsent": ends.command.failed,
+        }
+        return total(vars(ends.frames.counts), ends.news.counts, own)
 
     def _take(self, items: Sequence[Item]) -> None:
         sites = self.settings.sites
@@ -279,15 +284,10 @@ class Platform:
         self._configs.append((name, frame.data, frame.arrival_ns or 0))
 
     def _sum_up(self, log: Log) -> None:
-        summary, counts = self.summary, self.ends.frames.counts
-        summary.unread = dict(self.engine.unread)
+        summary = self.summary
+        summary.counts, summary.unread = self._counts(), dict(self.engine.unread)
         summary.final_state = str(self.engine.state.system)
-        summary.foreign, summary.undecodable, summary.own_drops = counts.foreign, counts.undecodable, counts.own_drops
-        summary.unreadable_yet = counts.unreadable_yet
-        summary.crowded = counts.crowded + self._waiting.crowded
-        summary.overtaken_configs = self._waiting.overtaken
-        summary.unsent = self.ends.command.failed
-        summary.session, summary.unlogged_ticks = log.session, log.unlogged_ticks
+        summary.unlogged_ticks = log.unlogged_ticks
         summary.log_parts = list(map(str, log.parts))
 
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import LoopName, Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
+from dcon.link.counts import COUNTS, total
 from dcon.session.codec import Watchdog
 
 GPS_NS = 3_000_000_000
@@ -49,6 +51,8 @@ class Heard(NamedTuple):
     server: Server | None = None
     ignored: int = 0
     """Datagrams that say nothing which is known here."""
+    counts: Mapping[str, Mapping[str, int]] = MappingProxyType({})
+    """What each loop of the aides has counted."""
 
 
 class Said(NamedTuple):
@@ -104,13 +108,30 @@ def _server(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
     return Said(heard._replace(server=Server(now_ns, *(None if value is None else _number(value) for value in found))))
 
 
-_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server}
+def _counts(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
+    loop = LoopName(said["loop"])
+    counts = {name: _count(value) for name, value in said["counts"].items() if name in COUNTS}
+    return Said(heard._replace(counts={**heard.counts, loop: counts}))
+
+
+_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server, "counts": _counts}
 
 
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return float(value)
+
+
+def _count(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 1 << 63:
+        raise ValueError(f"{value!r} is no count")
+    return value
+
+
+def counted(heard: Heard) -> dict[str, int]:
+    """All that was counted of the news, and by who tells them."""
+    return total({"news_ignored": heard.ignored}, *heard.counts.values())
 
 
 def _time_ns(value: object) -> int:

@@ -7,8 +7,9 @@ run folder they are the sockets of other processes (:mod:`dcon.control.linked`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from dcon.core.values import NOTHING, Order, Surroundings
@@ -43,6 +44,10 @@ class Told(NamedTuple):
 
 class News(Protocol):
     """What a tick is told."""
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What the news count (:data:`dcon.link.counts.COUNTS`)."""
 
     def listen(self, now_ns: int) -> None:
         """Take in what is there already, for the tick to come."""
@@ -90,6 +95,8 @@ class Log(Protocol):
 
 class Quiet:
     """Nothing is told."""
+
+    counts: Mapping[str, int] = MappingProxyType({})
 
     def listen(self, now_ns: int) -> None:
         pass

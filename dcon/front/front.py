@@ -26,7 +26,7 @@ PRIORITY = 9
 
 
 class Outlet:
-    """One end of the pair. ``counts.crowded`` is what it had no room for."""
+    """One end of the pair. What it had no room for is counted in ``counts``."""
 
     def __init__(self, sock: socket.socket, counts: Counts) -> None:
         sock.setblocking(False)
@@ -65,6 +65,7 @@ class Outlet:
         for item in items:
             match item:
                 case PmuFrameIn(pmu, _, True):
+                    self._counts.overtaken_configs += pmu in self._configs
                     self._configs[pmu] = item
                 case PmuFrameIn():
                     self._counts.crowded += 1
@@ -72,6 +73,7 @@ class Outlet:
                     pass
                 case _:
                     self._news.append(item)
+        self._counts.untold += len(self._news[:-KEPT])
         del self._news[:-KEPT]
 
 

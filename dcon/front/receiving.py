@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from dcon.link.crossing import Counts, Item, PmuFrameIn
-from pmutools.c37118 import FrameType, Loss, Message, StreamConfig
-from pmutools.c37118.config import whole
+from pmutools.c37118 import FrameType, Message, StreamConfig
+from pmutools.c37118.config import is_fragment, whole
 from pmutools.c37118.constants import MAX_FRAME_SIZE
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -28,6 +28,8 @@ class Reception:
     def __init__(self, receivers: Receivers, counts: Counts | None = None) -> None:
         self.receivers = receivers
         self.counts = Counts() if counts is None else counts
+        self._unusable = 0
+        """Frames that were read, and cannot be handed on, or rule nothing."""
         self._configs: dict[int, StreamConfig] = {}
         self._since_ns: dict[int, int] = {}
         """By PMU, from which arrival on its frames count: what was held for its first configuration may be old."""
@@ -46,23 +48,30 @@ class Reception:
                 counts.own_drops += item.datagrams
                 take(item)
             for found in receivers.parse(item):
-                if isinstance(found, Loss):
-                    counts.undecodable += 1
-                else:
+                if isinstance(found, Message):  # what is lost the receivers count
                     self._route(found, take)
-        counts.foreign = receivers.unwanted
+        counts.foreign, counts.held = receivers.unwanted, receivers.held
+        counts.undecodable = receivers.undecodable + self._unusable
 
     def _route(self, message: Message, take: Callable[[Item], object]) -> None:
         frame, flow, config = message
-        for owner in self.receivers.owners(flow, frame.idcode):
-            if frame.type is FrameType.DATA:
+        owners = self.receivers.owners(flow, frame.idcode)
+        if frame.type is FrameType.DATA:
+            for owner in owners:
                 if owner in self._refused:
-                    self.counts.undecodable += 1
+                    self._unusable += 1
                 elif (frame.arrival_ns or 0) < self._since_ns.get(owner, 0):
                     self.counts.unreadable_yet += 1
                 else:
                     take(PmuFrameIn(owner, frame))
-            elif config is not None and frame.type.rules_data and self._configs.get(owner) != config:
+        elif config is None and frame.type.is_config and not is_fragment(frame.data):
+            self._unusable += 1
+        else:
+            fresh = [owner for owner in owners if self._configs.get(owner) != config]
+            if config is None or not frame.type.rules_data or not fresh:
+                self.counts.unneeded += 1
+                return
+            for owner in fresh:
                 self._configs[owner] = config
                 self._since_ns.setdefault(owner, (frame.arrival_ns or 0) - HELD_NS)
                 take(self._handed_on(owner, message, config))
@@ -73,7 +82,7 @@ class Reception:
         data = whole(frame.data, config)
         if len(data) > MAX_FRAME_SIZE:
             self._refused.add(owner)
-            self.counts.undecodable += 1
+            self._unusable += 1
             where = f"{flow.transport}://{flow.source}"
             why = f"its configuration takes {len(data)} bytes, which is more than the {MAX_FRAME_SIZE} of a frame"
             return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), f"{why}; it is refused", frame.idcode, flow)

@@ -44,18 +44,17 @@ class Kind(IntEnum):
 
 @dataclass
 class Counts:
-    """What did not become frames of a tick, since the start."""
+    """What did not become frames of a tick, since the start: the front's share of :data:`dcon.link.counts.COUNTS`."""
 
     foreign: int = 0
-    """Frames that no PMU of the settings sends: another IDCODE, or another source."""
     undecodable: int = 0
-    """Runs of bytes in no frame, and frames of a configuration that is too long to be handed on."""
-    own_drops: int = 0
-    """Datagrams that a full receive buffer of this machine has lost."""
-    crowded: int = 0
-    """Frames that the control process did not take in time."""
+    held: int = 0
     unreadable_yet: int = 0
-    """Frames that came more than a second before the first configuration of their PMU."""
+    unneeded: int = 0
+    own_drops: int = 0
+    crowded: int = 0
+    overtaken_configs: int = 0
+    untold: int = 0
 
 
 class PmuFrameIn(NamedTuple):

@@ -92,11 +92,10 @@ def _bound(path: Path, kind: int, buffer: int | None) -> socket.socket:
 
 
 class Sender:
-    """Sends datagrams to one name; what is refused or not taken at once is counted, never raised, never waited for."""
+    """Sends datagrams to one name; what is refused or not taken at once is told, never raised, never waited for."""
 
     def __init__(self, path: Path) -> None:
         self.path = os.fspath(path)
-        self.failed = 0
         self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._sock.setblocking(False)
 
@@ -105,7 +104,6 @@ class Sender:
         try:
             self._sock.sendto(datagram, self.path)
         except OSError:
-            self.failed += 1
             return False
         return True
 

@@ -22,8 +22,6 @@ class Shipping:
         """``path`` of the server's socket."""
         self.path = str(path)
         self.shipper = shipper
-        self.failed = 0
-        """Connections that broke."""
         self._sock: socket.socket | None = None
         self._tried_ns: int | None = None
 
@@ -70,7 +68,7 @@ class Shipping:
             except OSError:
                 message = b""
             if not message:
-                self._broken()
+                self.close()
                 return False
             self.shipper.told(message)
         return True
@@ -83,10 +81,6 @@ class Shipping:
         except BlockingIOError:
             return False
         except OSError:
-            self._broken()
+            self.close()
             return False
         return True
-
-    def _broken(self) -> None:
-        self.failed += 1
-        self.close()

@@ -12,6 +12,7 @@ from google.protobuf.message import DecodeError
 from dcon.core.rows import CORE
 from dcon.core.values import Event, InstanceState, Order
 from dcon.link.bundle import Bundle, Entry
+from dcon.link.counts import total
 from dcon.server.told import shown
 from dcon.session import codec
 from dcon.session.head import Head
@@ -23,7 +24,9 @@ MOST_FLAGS = 1000
 """Entries of the flag register that are kept."""
 TEXTS = {row.name: row.text for row in CORE.rows}
 WELL = (InstanceState.READY, InstanceState.HELD)
-SHOWN = frozenset(("Tick", "Instance", "Event", "Flag", "Setting", "Surroundings", "Pdci", "Watchdog", "Timing"))
+SHOWN = frozenset(
+    ("Tick", "Instance", "Event", "Flag", "Setting", "Surroundings", "Pdci", "Watchdog", "Timing", "Counts")
+)
 
 
 class News(NamedTuple):
@@ -101,6 +104,7 @@ class Newest:
             "surroundings": None if told is None else _surroundings(told),
             "line": self._line(),
             "timing": self._timing(),
+            "counts": self._counts(),
             "events": list(self._events),
         }
 
@@ -188,11 +192,15 @@ class Newest:
             "dcon_enabled": line.dcon_enabled,
         }
 
+    def _counts(self) -> dict[str, int] | None:
+        counts = self._last.get("Counts")
+        return None if counts is None else total(dict(zip(counts.name, counts.value, strict=False)))
+
     def _timing(self) -> dict[str, Any] | None:
         timing = self._last.get("Timing")
         if timing is None:
             return None
-        return None if timing is None else {"compute_us": timing.compute_us, "late_us": timing.late_us}
+        return {"compute_us": timing.compute_us, "late_us": timing.late_us}
 
 
 def _surroundings(message: Any) -> dict[str, Any]:

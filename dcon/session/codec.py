@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dcon.core.values import (
@@ -166,6 +166,13 @@ _TOLD = frozenset(Surroundings._fields) - {"pdci", "unread"}
 
 def encode_timing(tick_ns: int, timing: Timing) -> bytes:
     message = message_class("Timing")(tick_ns=tick_ns, compute_us=timing.compute_us, late_us=timing.late_us)
+    return bytes(message.SerializeToString())
+
+
+def encode_counts(tick_ns: int, counts: Mapping[str, int]) -> bytes:
+    """By name; those that are 0 are left out."""
+    known = {name: value for name, value in counts.items() if value}
+    message = message_class("Counts")(tick_ns=tick_ns, name=list(known), value=list(known.values()))
     return bytes(message.SerializeToString())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from dcon.core.values import NOTHING, Order, Pdci, Record, Surroundings
 from dcon.engine import Memory
@@ -23,15 +23,15 @@ def tick_entries(
     *,
     timing: Timing | None = None,
     pdci: Pdci | None = None,
+    counts: Mapping[str, int] | None = None,
     surroundings: Surroundings = NOTHING,
     memory: Memory | None = None,
 ) -> list[Entry]:
     """One tick: the ``frames``, ``orders`` and ``surroundings`` it was given, what it decided, how it ran.
 
     ``instances`` are the names that ``record.active`` counts in. ``frames`` in the order in which the controller got
-    them. ``pdci`` is the line's status beside the tick; by default the one that the tick was told. With
-    ``memory``, the engine's before the tick, it is a checkpoint. Raises ValueError for a tick that is no POSIX time: a
-    frame's tick 0 means none.
+    them. ``pdci`` is the line's status beside the tick; by default the one that the tick was told. ``counts`` are what
+    the platform has counted by then. Raises ValueError for a tick that is no POSIX time: a frame's tick 0 means none.
     """
     tick_ns = record.tick_ns
     if tick_ns <= 0:
@@ -59,6 +59,8 @@ def tick_entries(
         add("Flag", codec.encode_flag(tick_ns, flag))
     if timing is not None:
         add("Timing", codec.encode_timing(tick_ns, timing))
+    if counts is not None:
+        add("Counts", codec.encode_counts(tick_ns, counts))
     if pdci is not None:
         add("Pdci", codec.encode_pdci(tick_ns, pdci), pdci.time_ns)
     return entries

@@ -192,6 +192,7 @@ class Watchdog:
             rounds=self._rounds,
             datagrams=self._datagrams,
             unsent=self._output.failed,
+            untold=sum(listener.failed for listener in self._listeners),
             dropped=self._report.dropped,
         )
         self._report.close()

@@ -20,6 +20,7 @@ from dcon.core.thresholds import Thresholds
 from dcon.core.values import SystemState
 from dcon.drivers import line_status
 from dcon.link import command
+from dcon.link.counts import COUNTS
 from dcon.places import IioKeys, OutputRegisters, StatusRegisters
 from dcon.sections import LineInput, Log, Output, Platform, Server
 from dcon.settings import ELSEWHERE
@@ -230,6 +231,7 @@ GENERATORS = {
     "settings-output": lambda: keys(Output),
     "settings-platform": lambda: keys(Platform),
     "settings-log": lambda: keys(Log),
+    "counts": lambda: table(("count", "of what"), ((code(name), text) for name, text in COUNTS.items())),
     "command-datagram": lambda: datagram(command),
     "status-datagram": lambda: datagram(line_status),
     "iio-keys": lambda: keys(IioKeys),

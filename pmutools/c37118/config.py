@@ -228,10 +228,15 @@ def decode_config(frame: bytes) -> tuple[Prefix, StreamConfig]:
     return prefix, decode_config_body(prefix, body)
 
 
+def is_fragment(frame: bytes) -> bool:
+    """Whether a configuration frame is one of several that make a CFG-3, by its CONT_IDX."""
+    return frame[1] >> 4 == FrameType.CFG3 and frame[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0"
+
+
 def whole(frame: bytes, config: StreamConfig) -> bytes:
     """What says ``config`` by itself: the frame that it came with, or all fragments, where that is one of them."""
-    is_fragment = config.kind is FrameType.CFG3 and frame[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0"
-    return encode_config(config) if is_fragment else frame
+    is_part = config.kind is FrameType.CFG3 and frame[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0"
+    return encode_config(config) if is_part else frame
 
 
 def frames_in(data: bytes) -> list[bytes]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
@@ -24,6 +25,7 @@ from pmutools.c37118.config import (
     StreamConfig,
     decode_config,
     decode_config_body,
+    is_fragment,
 )
 from pmutools.c37118.config_kinds import abridges
 from pmutools.c37118.constants import CHK_SIZE, PREFIX_SIZE, FrameType
@@ -164,6 +166,10 @@ class Demux:
         self._waiting: dict[_Place, dict[Flow, _FlowState]] = {}
         """Who holds data, the place that has waited longest first."""
         self._held_bytes = 0
+        self.runs = 0
+        """Runs of bytes in no frame so far, skipped or to be ignored; of a stream, a read may cut one in two."""
+        self.held_frames = 0
+        """Data frames that wait for a configuration now."""
         self.put_on_hold: list[int] = []
         """IDCODEs of the data frames that the last :meth:`feed` has put on hold."""
         self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
@@ -270,7 +276,7 @@ class Demux:
             for at, arrival_ns in zip(places, arrivals_ns, strict=True)
         ]
         held.nbytes += len(data)
-        self._held_bytes += len(data)
+        self._now_hold(len(arrivals_ns), len(data))
         self.tally.fed += len(data)
         state.fresh = True
         state.framer.pass_over(len(data))
@@ -304,7 +310,7 @@ class Demux:
         state = self._flows.get(flow)
         if state is not None and (held := state.held.pop(idcode, None)) is not None:
             _forget(self._waiting, (state.host, idcode), flow)
-            self._held_bytes -= held.nbytes
+            self._now_hold(-len(held.frames), -held.nbytes)
             self.tally.ignored += held.nbytes
 
     def _silent_flow(self) -> Flow:
@@ -331,6 +337,7 @@ class Demux:
 
     def _take(self, state: _FlowState, item: Frame | Skipped, out: list[Message | Loss]) -> None:
         if isinstance(item, Skipped):
+            self.runs += 1
             self._lose(state, item, out)
             return
         if not state.proven:
@@ -380,13 +387,8 @@ class Demux:
 
     def _configure(self, state: _FlowState, frame: Frame, kind: FrameType, out: list[Message | Loss]) -> None:
         config: StreamConfig | None = None
-        try:
-            if kind is FrameType.CFG3 and frame.data[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0":
-                config = self._join(state, frame)
-            else:
-                config = decode_config(frame.data)[1]
-        except WireError:
-            pass  # a good frame whose content is not: it stays a message, with no configuration
+        with suppress(WireError):  # a good frame whose content is not: it stays a message, with no configuration
+            config = self._join(state, frame) if is_fragment(frame.data) else decode_config(frame.data)[1]
         current = state.configs.get(config.idcode) if config is not None else None
         if config is not None and current is not None and abridges(config, current):
             config = current
@@ -412,7 +414,7 @@ class Demux:
         fitting = [frame for frame in held.frames if len(frame.data) == config.frame_size]
         held.frames = deque(frame for frame in held.frames if len(frame.data) != config.frame_size)
         held.nbytes -= len(fitting) * config.frame_size
-        self._held_bytes -= len(fitting) * config.frame_size
+        self._now_hold(-len(fitting), -len(fitting) * config.frame_size)
         if not held.frames:
             self._give_up(state, config.idcode, out)
         for frame in fitting:
@@ -441,7 +443,7 @@ class Demux:
         while held is not None and held.frames and held.nbytes + size > HELD_BYTES:
             oldest = held.frames.popleft()
             held.nbytes -= len(oldest.data)
-            self._held_bytes -= len(oldest.data)
+            self._now_hold(-1, -len(oldest.data))
             self._drop(state, [oldest], out)
         while self._waiting and self._held_bytes + size > ALL_HELD_BYTES:
             (_, idcode), flows = next(iter(self._waiting.items()))
@@ -449,14 +451,19 @@ class Demux:
         held = state.held.setdefault(frame.idcode, _Held())
         held.frames.append(frame)
         held.nbytes += size
-        self._held_bytes += size
+        self._now_hold(1, size)
         self.put_on_hold.append(frame.idcode)
         self._waiting.setdefault((state.host, frame.idcode), {})[state.flow] = state
+
+    def _now_hold(self, frames: int, nbytes: int) -> None:
+        """So many more are held, or fewer."""
+        self.held_frames += frames
+        self._held_bytes += nbytes
 
     def _give_up(self, state: _FlowState, idcode: int, out: list[Message | Loss]) -> None:
         """Hold nothing of this stream any longer."""
         held = state.held.pop(idcode)
-        self._held_bytes -= held.nbytes
+        self._now_hold(-len(held.frames), -held.nbytes)
         _forget(self._waiting, (state.host, idcode), state.flow)
         self._drop(state, held.frames, out)
 

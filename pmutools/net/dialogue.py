@@ -74,6 +74,11 @@ class LinkEvent(NamedTuple):
     label: str = ""
 
 
+def own_drops(where: str, owners: tuple[int, ...], datagrams: int) -> LinkEvent:
+    """That the receive buffer of ``where`` was full."""
+    return LinkEvent(LinkKind.OWN_DROPS, where, owners, "this machine's receive buffer was full", datagrams=datagrams)
+
+
 class Dialogue:
     """Plays a :class:`ClientRole`: feeds it what is heard and the passing of time, hands its actions to ``act``.
 

@@ -21,7 +21,7 @@ from pmutools.c37118.session import (
 )
 from pmutools.errors import SettingsError, SourceError
 from pmutools.flow import Chunk, Flow
-from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind, silence
+from pmutools.net.dialogue import Dialogue, LinkEvent, LinkKind, own_drops, silence
 from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.net.intake import Intake, Swept
 from pmutools.net.reactor import READ, WRITE, Reactor, Timer
@@ -126,6 +126,11 @@ class CommandLink:
         """What the kernel tells of this endpoint's connections, those that have ended included."""
         now = self._transport.counts() if isinstance(self._transport, TcpClient) else TcpCounts()
         return TcpCounts(*map(sum, zip(self._ended, now, strict=True)))
+
+    def tell_drops(self) -> None:
+        """Tell of datagrams that this connection's receive buffer has lost since this was last done."""
+        if isinstance(self._transport, UdpSocket) and (lost := self._transport.newly_dropped()):
+            self.plumbing.emit(own_drops(str(self.endpoint), self.owners, lost))
 
     def close(self) -> None:
         """Stop the data, unless they go to a group that others may be listening to, and hang up."""
@@ -246,6 +251,7 @@ class CommandLink:
             self._timer.cancelled = True
         if self._transport is not None:
             self._ended = self.tcp_counts()
+            self.tell_drops()
             self.plumbing.reactor.forget(self._transport)
             if (intake := self.plumbing.intake) is not None:
                 intake.forget(self._transport)

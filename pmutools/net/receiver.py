@@ -33,7 +33,7 @@ from pmutools.c37118.demux import DataRun, Demux, Loss, Message
 from pmutools.c37118.session import CFG2_FIRST, CFG3_FIRST, SAVED_CONFIG, ClientTable, Timing
 from pmutools.clock import Clock
 from pmutools.flow import Chunk, Flow
-from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.net.dialogue import LinkEvent, LinkKind, own_drops
 from pmutools.net.endpoint import Endpoint, Scheme, is_multicast, scoped
 from pmutools.net.intake import Intake, Swept
 from pmutools.net.link import CommandLink, Plumbing
@@ -84,7 +84,10 @@ class Receivers:
         self.endpoints = tuple(endpoints)
         self.demux = Demux(saved)
         self.unwanted = 0
-        """Messages that no endpoint asked for."""
+        """Messages that no endpoint asked for, and what else came from addresses of which none asks for anything."""
+        self.undecodable = 0
+        """From the others: runs of bytes in no frame, empty datagrams, and data frames given up for want of a
+        configuration."""
         self._saved = frozenset(config.idcode for config in saved)
         self._first: ClientTable = CFG3_FIRST if want_cfg3 else CFG2_FIRST
         self._timing = timing or Timing()
@@ -127,11 +130,16 @@ class Receivers:
         if isinstance(item, LinkEvent):
             if item.kind not in _ENDS or item.flow is None:
                 return []
+            runs = self.demux.runs
+            lost = self.demux.end(item.flow)
+            self._count(item.flow, self.demux.runs - runs, lost)
             self.routes.end(item.flow)
-            return self.demux.end(item.flow)
+            return lost
         out: list[Message | Loss] = []
         now_ns = self._clock.monotonic_ns()
+        runs = self.demux.runs
         found = self.demux.feed(item)
+        self._count(item.flow, self.demux.runs - runs + (not item.data and not item.flow.is_stream), found)
         for part in found:
             if isinstance(part, Loss):
                 out.append(part)
@@ -208,6 +216,11 @@ class Receivers:
         """The places of the endpoints that a stream belongs to."""
         route = self.routes.find(flow, idcode)
         return route.owners if route is not None else ()
+
+    @property
+    def held(self) -> int:
+        """Data frames that wait for a configuration now."""
+        return self.demux.held_frames
 
     def local(self, index: int) -> Address | None:
         """Where endpoint ``index`` is bound, or None for one that only connects."""
@@ -311,6 +324,14 @@ class Receivers:
             link.listen()
         return intake
 
+    def _count(self, flow: Flow, runs: int, found: Sequence[Message | Loss]) -> None:
+        """Count what is in no message: ``runs`` of ``flow``, and data frames that nobody holds any longer."""
+        if runs and self.routes.hears(flow):
+            self.undecodable += runs
+        else:
+            self.unwanted += runs
+        self.undecodable += sum(isinstance(part, Loss) and part.undecoded is not None for part in found)
+
     def _note_held(self, flow: Flow, idcode: int, count: int, now_ns: int) -> None:
         """Data frames that fit no configuration do not come out of the demultiplexer; notice them all the same."""
         if not self.routes.hold(flow, idcode, now_ns):
@@ -328,13 +349,10 @@ class Receivers:
 
     def _look_for_drops(self) -> None:
         for listener in self._listeners.values():
-            drops = listener.sock.own_drops
-            if drops is not None and drops != listener.drops:
-                lost = (drops - listener.drops) & 0xFFFFFFFF
-                listener.drops = drops
-                where = f"udp://{listener.sock.address}"
-                detail = "this machine's receive buffer was full"
-                self._out.append(LinkEvent(LinkKind.OWN_DROPS, where, listener.owners, detail, datagrams=lost))
+            if lost := listener.sock.newly_dropped():
+                self._out.append(own_drops(f"udp://{listener.sock.address}", listener.owners, lost))
+        for link in self._links:
+            link.tell_drops()
 
     def _tell_of_nothing(self) -> None:
         noise = {index: heard.noise for heard in self._listeners.values() for index in heard.owners if heard.noise}

@@ -68,7 +68,6 @@ class Listener:
         self.by_host: dict[str, list[CommandLink]] = {}
         """Links whose data come here, by the host that sends them."""
         self.owners: tuple[int, ...] = ()
-        self.drops = sock.own_drops or 0
         self.senders: dict[int, Flow] = {}
         """Who sent an IDCODE last, where nobody was asked for it."""
         self.rivals: dict[int, Rivals] = {}
@@ -76,6 +75,11 @@ class Listener:
         """IDCODEs whose two senders were told of."""
         self.noise = ""
         """What came first that is no C37.118, and from where."""
+
+    def hears(self, host: str) -> bool:
+        """Whether anything that ``host`` sends here may be asked for."""
+        subscribed = (endpoint for endpoints in self.by_idcode.values() for _, endpoint in endpoints)
+        return host in self.by_host or any(endpoint.source in (None, host) for endpoint in subscribed)
 
     def know_owners(self) -> None:
         """All that hear through it are known now."""
@@ -137,6 +141,13 @@ class Routes:
             self.notices.tell(LinkEvent(LinkKind.NO_CONFIG, where, route.owners, detail, idcode, flow))
         route.dialogue.hear_misfit(now_ns)
         return True
+
+    def hears(self, flow: Flow) -> bool:
+        """Whether anything of a flow may be asked for, whatever its IDCODE."""
+        if flow in self._plumbing.links:
+            return True
+        listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
+        return listener is not None and listener.hears(flow.host)
 
     def note_noise(self, chunk: Chunk) -> None:
         """A chunk came in which no frame was found, from a flow that has shown none yet, or may yet end one."""

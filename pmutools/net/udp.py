@@ -130,6 +130,7 @@ class UdpSocket:
         self._settled_ns = time.monotonic_ns() + SETTLING_NS
         self._flows: dict[bytes | tuple[str, int], Flow] = {}
         self._stamps_departures = False
+        self._dropped = self.own_drops or 0
 
     def __enter__(self) -> UdpSocket:
         return self
@@ -231,6 +232,14 @@ class UdpSocket:
         except OSError:
             return None
         return int(struct.unpack_from("=I", info, 4 * linux.MEMINFO_DROPS)[0]) if len(info) == 36 else None
+
+    def newly_dropped(self) -> int:
+        """Own drops since this was last asked; those that are not known are 0."""
+        drops, before = self.own_drops, self._dropped
+        if drops is None:
+            return 0
+        self._dropped = drops
+        return (drops - before) & 0xFFFFFFFF
 
     # --- sending
 

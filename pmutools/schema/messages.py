@@ -190,13 +190,13 @@ MESSAGES: dict[str, MessageType] = {
             Field("relays_closed", "bool", "By the watchdog's word, the command passes."),
         ),
     ),
-    "Checkpoint": MessageType(
-        "/dcon/checkpoint",
-        "All that the controller remembered before a tick, now and then: a replay can begin with it.",
+    "Counts": MessageType(
+        "/dcon/counts",
+        "What did not become what it was sent for: frames and datagrams, counted since the platform began.",
         (
             _TICK,
-            Field("layout", "string", "What the numbers of memory are of: only a program with the same reads it."),
-            Field("memory", "string", "Nested lists as JSON, with NaN and Infinity; every number is exact."),
+            Field("name", "string", "What was counted; a count that is not named is 0.", "", True),
+            Field("value", "int64", "How many.", "", True),
         ),
     ),
 }

@@ -212,7 +212,7 @@ def test_an_order_for_which_the_controller_has_no_room_is_tried_again_then_refus
             while filler.send(b"a status"):
                 pass
             send(folder, AIDE, datagram(signed(folder, time_ns=time.time_ns()), str(folder / REPLIES)))
-            wait_for(lambda: aide.gate.accepted == 1)
+            wait_for(lambda: len(aide.handing) == 1)
             taken: list[bytes] = []
 
             def came() -> bool:

@@ -184,7 +184,7 @@ def test_a_source_that_changes_its_configuration_without_end_costs_little_and_re
     summary = made.run(3)
     told = [event for record in made.records for event in record.events if event.name.startswith("config_")]
     assert 0 < len(told) <= 2 * CONFIGS and len(caplog.records) <= CONFIGS
-    assert summary.overtaken_configs > 900 and summary.crowded > 50
+    assert summary.counts["overtaken_configs"] > 900 and summary.counts["crowded"] > 50
     last = next(record for record in made.records if record.tick_ns >= START_NS + round(2.9 * NS))
     assert last.active == 0 and last.state is SystemState.ACTIVE
     made.ended_well()
@@ -212,7 +212,7 @@ def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pyte
     news.append(LinkEvent(LinkKind.STREAMING, "udp://192.0.2.101:4713", (0,)))
     made = bench([*stream(1), *((START_NS + MS, event) for event in news)])
     summary = made.run(1)
-    assert summary.own_drops == 7
+    assert summary.counts["own_drops"] == 7
     told = [entry.getMessage() for entry in caplog.records]
     assert told[0] == "udp://127.0.0.1:4802: nothing has come; is the sender on?"
     assert told[1] == "udp://192.0.2.9:1: foreign IDCODE 1 comes from there"

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
+from typing import Any
 
 import pytest
 from support.live import CLOCK, Ear, data_frame, free_udp_port, stream, values
@@ -25,6 +26,7 @@ from pmutools.net.dialogue import LinkKind
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.receiver import Receivers
 from pmutools.net.tcp import TcpCounts
+from pmutools.net.udp import UdpSocket
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
@@ -259,6 +261,23 @@ def test_own_drops_are_told_apart_from_network_loss(monkeypatch: pytest.MonkeyPa
         assert len(ear.of(LinkKind.OWN_DROPS)) >= 2
 
 
+@pytest.mark.skipif(not linux.NATIVE, reason="SO_MEMINFO")
+def test_own_drops_of_a_commanded_stream_are_told_too(monkeypatch: pytest.MonkeyPatch, sender: socket.socket) -> None:
+    monkeypatch.setattr(receiver, "HOUSEKEEPING_NS", 20 * MS)
+
+    class Small(UdpSocket):
+        def __init__(self, host: str, port: int, **given: Any) -> None:
+            super().__init__(host, port, rcvbuf_bytes=4096, **given)
+
+    monkeypatch.setattr(link, "UdpSocket", Small)
+    with ears(f"udp+cmd://127.0.0.1:{sender.getsockname()[1]}?idcode=7") as ear:
+        _, client = sender.recvfrom(100)
+        for k in range(300):
+            sender.sendto(data_frame(stream(7), k * 10**9), client)
+        ear.until(lambda: len(ear.chunks) + sum(event.datagrams for event in ear.news) == 300)
+        assert ear.of(LinkKind.OWN_DROPS)
+
+
 def test_garbage_is_counted_and_does_no_harm(sender: socket.socket) -> None:
     rng = random.Random(1)
     with ears("udp://127.0.0.1:0") as ear:
@@ -272,6 +291,7 @@ def test_garbage_is_counted_and_does_no_harm(sender: socket.socket) -> None:
         ear.until(lambda: len(ear.chunks) == 201)
         tally = ear.receivers.demux.tally
         assert (tally.framed, tally.skipped_bytes) == (len(good), sum(map(len, junk)))
+        assert (ear.receivers.undecodable, ear.receivers.unwanted) == (200, 0)
 
 
 def test_a_flood_of_senders_is_forgotten_again(monkeypatch: pytest.MonkeyPatch, sender: socket.socket) -> None:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -26,7 +27,8 @@ from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, decode
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
 from dcon.settings import parse
-from pmutools.c37118 import Frame
+from pmutools.c37118 import Frame, encode_command, encode_header
+from pmutools.c37118.checksum import sealed
 from pmutools.c37118.config import encode_config
 from pmutools.clock import SystemClock
 from pmutools.flow import StampSource
@@ -128,6 +130,61 @@ def test_a_wrong_source_and_a_wrong_idcode_do_not_pass_and_are_counted(rig: Rig)
     rig.send(0)
     assert [item.pmu for item in rig.turns(1)] == [0]
     assert rig.counts.foreign == 5 + 2
+
+
+def nothings(rig: Rig) -> list[tuple[str, bytes, str]]:
+    """(which count, a datagram to N1's port that gives nothing, the address it comes from)."""
+    rng = random.Random(2)
+    frame, here = rig.streams.data("N1", time.time_ns()), "127.0.0.1"
+    body, header = frame[:-2], encode_header(rig.streams.configs["N1"].idcode, "a device")
+    config = encode_config(rig.streams.configs["N1"])
+    small = sealed(body[:2] + (len(body) - 2).to_bytes(2, "big") + body[4:-4])
+    return [
+        ("undecodable", b"", here),
+        ("undecodable", rng.randbytes(60), here),
+        ("undecodable", bytes(65_000), here),
+        ("undecodable", body + b"\0\0", here),
+        ("undecodable", body[:2] + b"\xff\xff" + body[4:], here),
+        ("undecodable", body[:2] + b"\0\3" + body[4:], here),
+        ("undecodable", frame[:-1], here),
+        ("undecodable", b"\xaa\x71" + frame[2:], here),
+        ("undecodable", sealed(b"\xaa\x83" + body[2:]), here),
+        ("undecodable", sealed(config[:2] + (60).to_bytes(2, "big") + config[4:58]), here),
+        ("foreign", rig.streams.data("S1", time.time_ns()), here),
+        ("foreign", encode_config(rig.streams.configs["S1"]), here),
+        ("foreign", frame, "127.0.0.2"),
+        ("foreign", b"", "127.0.0.2"),
+        ("foreign", rng.randbytes(60), "127.0.0.2"),
+        ("unneeded", header, here),
+        ("unneeded", encode_command(rig.streams.configs["N1"].idcode, 2), here),
+        ("unneeded", config, here),
+        ("held", small, here),
+    ]
+
+
+@pytest.mark.parametrize("proven", [True, False])
+def test_each_datagram_that_gives_nothing_is_in_exactly_one_count(rig: Rig, proven: bool) -> None:
+    """Whether or not its sender has ever sent a good frame, and what it sends afterwards changes nothing."""
+    rig.configure()
+    rig.turns(2)
+    sent = Counter[str]()
+    senders = {host: rig.sender(host) for host in ("127.0.0.1", "127.0.0.2")}
+    kinds = nothings(rig)
+    if not proven:
+        kinds = [kind for kind in kinds if kind[0] == "undecodable" and not kind[1].startswith(b"\xaa\x31")]
+    for number, (count, datagram, host) in enumerate(kinds * 3):
+        senders[host].sendto(datagram, ("127.0.0.1", rig.ports[0]))
+        sent[count] += 1
+        if proven and number == len(kinds):
+            rig.send(0, sock=senders["127.0.0.1"])  # by the configuration that another port of its host has shown
+    end_s = time.monotonic() + 5
+    while sum(vars(rig.counts).values()) < sum(sent.values()) and time.monotonic() < end_s:
+        assert not [item for item in rig.turn() if isinstance(item, PmuFrameIn) and item.is_config]
+    rig.send(0, sock=senders["127.0.0.1"])  # now it is proven
+    assert len(rig.turns(1)) == 1
+    assert {name: value for name, value in vars(rig.counts).items() if value} == sent
+    for sock in senders.values():
+        sock.close()
 
 
 def test_a_malformed_flood_of_one_port_delays_nobody_by_more_than_a_round(rig: Rig) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from support.running import Running
+from support.running import Running, flood, frames_now
 
 from dcon.cli import dcon
 from pmutools.cli.shell import run
@@ -34,6 +36,30 @@ def shown(site: Running, capsys: pytest.CaptureFixture[str]) -> list[str]:
     capsys.readouterr()
     assert run(dcon(), ["ctl", "status", "--to", f"127.0.0.1:{site.server_port}"]) == 0
     return capsys.readouterr().out.splitlines()
+
+
+def test_what_a_flood_brings_that_is_no_frame_is_counted_and_shown(
+    site: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the permitted address, and from a sender that never sends a frame."""
+    site.in_state("STANDBY")
+    rng = random.Random(1)
+    (frame,) = frames_now("N1", 1)
+    before = site.status()["counts"]
+    with flood(site.ports[0], [rng.randbytes(60), b"", frame[:-1], frame[:20] + b"?" + frame[21:]], 0.5):
+        pass
+    with flood(site.ports[0], [frame, rng.randbytes(60)], 0.1, source="127.0.0.2"):
+        pass
+
+    def counted(status: dict[str, Any]) -> bool:
+        more = {name: value - before[name] for name, value in status["counts"].items() if value != before[name]}
+        more.pop("unneeded", None)  # the player repeats its configurations
+        return more.pop("own_drops", 0) + sum(more.values()) == 6000 and set(more) <= {"undecodable", "foreign"}
+
+    status = site.until(counted, "each datagram counted")
+    counts = status["counts"]
+    (line,) = [line for line in shown(site, capsys) if line.startswith("not taken: ")]
+    assert f"foreign {counts['foreign']}, undecodable {counts['undecodable']}" in line
 
 
 def test_a_controller_that_stands_still(site: Running, capsys: pytest.CaptureFixture[str]) -> None:

@@ -81,7 +81,10 @@ def log_tick(
     surroundings: Surroundings = NOTHING,
 ) -> None:
     """Log one tick, as a controller with these ``instances`` does."""
-    entries = tick_entries(instances, record, frames, orders, timing=timing, pdci=pdci, surroundings=surroundings)
+    told = {"foreign": 3, "held": 0}
+    entries = tick_entries(
+        instances, record, frames, orders, timing=timing, pdci=pdci, counts=told, surroundings=surroundings
+    )
     log.write(entries, record.tick_ns)
 
 

@@ -71,7 +71,7 @@ class Script:
         self.demux = Demux()
         self.waiting: deque[tuple[int, Item]] = deque()
         self.closed = False
-        self.unwanted = 0
+        self.unwanted = self.undecodable = self.held = 0
 
     def play(self, items: Iterable[tuple[int, Item]]) -> None:
         """Items with their arrival, in ns of unstepped UTC."""
