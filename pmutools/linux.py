@@ -33,8 +33,9 @@ TX_SOFTWARE, SOFTWARE, OPT_ID, OPT_TSONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 """Flags of SO_TIMESTAMPING: stamp what is sent, report such stamps, number them, leave the datagram out."""
 RX_HARDWARE, RX_SOFTWARE, RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 6
 """More of them: have the network card, and the kernel, stamp what arrives; report the card's stamps as they are."""
-MEMINFO_DROPS = 8
-"""Index of the drop counter among the nine uint32 of SO_MEMINFO."""
+MEMINFO_RMEM_ALLOC, MEMINFO_DROPS = 0, 8
+"""Among the nine uint32 of SO_MEMINFO: bytes that wait to be read, with what the kernel keeps about them (or a while
+ago: it may count them later), and the drop counter."""
 
 SOL_SOCKET = 1
 MSG_DONTWAIT = 0x40
@@ -244,8 +245,8 @@ class ReceiveBatch:
         self._headers_at = ctypes.c_void_p(_address(self._headers))
         self._view = memoryview(self._data)
 
-    def receive(self, fd: int) -> list[Datagram]:
-        """All that waits on a UDP socket, up to ``size``; empty if nothing does.
+    def receive(self, fd: int, most: int | None = None) -> list[Datagram]:
+        """All that waits on a UDP socket, up to ``most`` (``size`` unless given); empty if nothing does.
 
         Raises
         ------
@@ -254,7 +255,7 @@ class ReceiveBatch:
         """
         assert libc is not None
         self._headers[:] = self._fresh  # the kernel overwrites the lengths
-        count = libc.recvmmsg(fd, self._headers_at, self.size, MSG_DONTWAIT, None)
+        count = libc.recvmmsg(fd, self._headers_at, min(most or self.size, self.size), MSG_DONTWAIT, None)
         if count < 0:
             error = ctypes.get_errno()
             if error in (errno.EAGAIN, errno.EINTR):

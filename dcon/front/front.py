@@ -9,15 +9,20 @@ kept. It ends when the pair does.
 from __future__ import annotations
 
 import socket
+from collections import deque
 
 from dcon.front.receiving import Reception
 from dcon.link.crossing import Counts, Item, PmuFrameIn, encode
 from dcon.link.pulse import Pulse
 from pmutools.clock import Clock
+from pmutools.flow import Chunk
+from pmutools.net.dialogue import LinkEvent
 
 ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
 BEAT_NS = 10_000_000
+PARSE_NS = 20_000_000
+"""A turn parses for so long, and one datagram more; what is left of a round waits for the next turn."""
 KEPT = 1000
 """News that may wait for room in the pair; the oldest go first. Of configurations the newest of each PMU waits too."""
 COUNTS_NS = 500_000_000
@@ -85,17 +90,23 @@ class Front:
         self.reception, self.outlet, self._clock = reception, outlet, clock
         self._udp, self._parse = udp, parse
         self._counted_ns = 0
+        self._received = deque[Chunk | LinkEvent]()
+        """Of the last round, what is not parsed yet."""
 
     def run(self) -> None:
         while self.outlet.is_open:
             self.turn()
 
     def turn(self) -> None:
-        reception, outlet = self.reception, self.outlet
-        received = reception.receive(ROUND_NS)
-        self._udp.beat(self._clock.monotonic_ns())
-        reception.parse(received, outlet.add)
-        now_ns = self._clock.monotonic_ns()
+        reception, outlet, clock, received = self.reception, self.outlet, self._clock, self._received
+        if not received:
+            received.extend(reception.receive(ROUND_NS))
+        now_ns = clock.monotonic_ns()
+        self._udp.beat(now_ns)
+        end_ns = now_ns + PARSE_NS
+        while received and now_ns < end_ns:
+            reception.parse((received.popleft(),), outlet.add)
+            now_ns = clock.monotonic_ns()
         if now_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns = now_ns
             outlet.add(Counts(**vars(reception.counts)))  # it also finds out whether anybody is there

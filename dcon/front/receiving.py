@@ -1,8 +1,9 @@
 """From sockets to frames of the settings' PMUs, in one thread: receive, then parse, in turn.
 
 The kernel stamps arrivals, so parsing costs no stamp its exactness. What is not of a configured source and IDCODE goes
-no further. One round takes at most 256 datagrams from each port (:data:`pmutools.net.udp.READ_BATCHES`), so a flood of
-one port holds up the frames of the others by the time that those take.
+no further. One round takes at most 256 datagrams from each port, and of large ones fewer (``READ_DATAGRAMS`` and
+``READ_BYTES`` of :mod:`pmutools.net.udp`), so a flood of one port holds up the frames of the others by the time that
+those take.
 """
 
 from __future__ import annotations
@@ -66,11 +67,11 @@ class Reception:
                     take(PmuFrameIn(owner, frame))
         elif config is None and frame.type.is_config and not is_fragment(frame.data):
             self._unusable += 1
+        elif config is None or not frame.type.rules_data:
+            self.counts.unneeded += 1
         else:
             fresh = [owner for owner in owners if self._configs.get(owner) != config]
-            if config is None or not frame.type.rules_data or not fresh:
-                self.counts.unneeded += 1
-                return
+            self.counts.repeated += not fresh
             for owner in fresh:
                 self._configs[owner] = config
                 self._since_ns.setdefault(owner, (frame.arrival_ns or 0) - HELD_NS)

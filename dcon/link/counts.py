@@ -6,7 +6,7 @@ process adds what it counts itself, logs all of it each second (``/dcon/counts``
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 COUNTS: Final[Mapping[str, str]] = {
@@ -20,9 +20,8 @@ COUNTS: Final[Mapping[str, str]] = {
     ),
     "held": "data frames that wait for a configuration now",
     "unreadable_yet": "frames that came more than a second before the first configuration of their PMU",
-    "unneeded": (
-        "good frames that tell nothing new: headers, commands, CFG-1, parts of a CFG-3, a configuration that is known"
-    ),
+    "unneeded": "good frames that rule no data by themselves: headers, commands, CFG-1, parts of a CFG-3",
+    "repeated": "configurations that are known already",
     "own_drops": "datagrams that this machine's full receive buffers have lost",
     "crowded": (
         "frames that came in a flood, or while the control process stood still, and found no room to wait; those of a "
@@ -42,12 +41,15 @@ COUNTS: Final[Mapping[str, str]] = {
 }
 """Names, and what each counts, since the start of its process; ``held`` is now."""
 
+USUAL: Final = frozenset(("repeated",))
+"""A spontaneous sender repeats its configuration about once a minute."""
+
 
 def total(*counts: Mapping[str, int]) -> dict[str, int]:
     """All of ``COUNTS``, added up by name; other names are left out."""
     return {name: sum(each.get(name, 0) for each in counts) for name in COUNTS}
 
 
-def words(counts: Mapping[str, int], names: Iterable[str] = COUNTS) -> str:
-    """Those that are not 0, in one line; "" for none."""
-    return ", ".join(f"{name} {counts[name]}" for name in names if counts.get(name))
+def words(counts: Mapping[str, int]) -> str:
+    """Those that are not 0, in one line, but for what any stream brings; "" for none."""
+    return ", ".join(f"{name} {counts[name]}" for name in COUNTS if name not in USUAL and counts.get(name))

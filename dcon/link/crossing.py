@@ -51,6 +51,7 @@ class Counts:
     held: int = 0
     unreadable_yet: int = 0
     unneeded: int = 0
+    repeated: int = 0
     own_drops: int = 0
     crowded: int = 0
     overtaken_configs: int = 0

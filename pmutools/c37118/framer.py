@@ -7,6 +7,9 @@ search goes on one byte past its SYNC, never at the size it claimed.
 The memory of a framer is bounded by one frame (64 KiB). A false SYNC that claims a long frame could hide the good
 frames behind it until that many bytes have come; so while an unproven candidate is incomplete, a complete good frame
 behind it whose first six bytes (SYNC, FRAMESIZE, IDCODE) this flow has shown before ends the wait.
+
+A datagram holds whole frames, and its bytes are right or it does not come: where :data:`TRIES` places in it look like
+the beginning of a frame and are none, what is left of it is skipped. So no datagram costs more than so many CHKs of it.
 """
 
 from __future__ import annotations
@@ -67,6 +70,8 @@ _TYPES = tuple(FrameType)
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 _AA = 0xAA
 _SYNC = re.compile(rb"\xaa(?:[\x00-\x5f\x83\x93\xa3\xb3\xc3\xd3\xe3\xf3]|\Z)", re.DOTALL)
+TRIES = 8
+"""Bad frames of a datagram that are looked behind."""
 _COMMAND_SIZE = 18
 _OF_A_READ = (StampSource.KERNEL, StampSource.HARDWARE)
 """Stamps that are those of a read's last bytes."""
@@ -150,6 +155,7 @@ class Framer:
         self, out: list[Frame | Skipped], arrival_ns: int | None, stamp_source: StampSource, *, final: bool
     ) -> None:
         buffer, at, end = self._buffer, 0, len(self._buffer)
+        tries = TRIES
         while at < end:
             reason, size = self._judge(buffer, at, end, final)
             if not size:
@@ -164,6 +170,9 @@ class Framer:
                 self._close_run(out)
                 out.append(Skipped(reason, self._offset + at, size, _claimed(buffer, at)))
             else:
+                if not self.streaming and reason is not SkipReason.NO_SYNC:
+                    tries -= 1
+                    size = size if tries else end - at
                 self._skip(reason, buffer, at, size)
             at += size
         self._buffer = buffer[at:]

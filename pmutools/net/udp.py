@@ -37,11 +37,12 @@ from pmutools.net.sockets import (
 if TYPE_CHECKING:
     from pmutools.linux_columns import DepartureBatch
 
-READ_BATCHES = 4
-"""Batches taken from one socket before the others have their turn."""
+READ_DATAGRAMS = 256
+"""Datagrams taken from one socket before the others have their turn."""
+READ_BYTES = 64 << 10
+"""Bytes, likewise, and what is left of a datagram."""
 _FLOWS = 1 << 16
 _DATAGRAM_BYTES = 1 << 16
-_PORTABLE_BATCH = 64
 
 
 class Target(NamedTuple):
@@ -168,7 +169,7 @@ class UdpSocket:
         self._flows.clear()
 
     def read(self) -> list[Chunk]:
-        """What has arrived, at most a few batches; empty when nothing waits.
+        """What has arrived, at most a few batches, of large datagrams one or two; empty when nothing waits.
 
         Raises
         ------
@@ -179,16 +180,20 @@ class UdpSocket:
             return self._read_portable()
         chunks: list[Chunk] = []
         receive, fd, settling = self._batches.receive, self._sock.fileno(), self._settling()
-        for _ in range(READ_BATCHES):
+        left = READ_BYTES
+        while left > 0 and len(chunks) < READ_DATAGRAMS:
+            few = (self._meminfo(linux.MEMINFO_RMEM_ALLOC) or 0) <= left
+            most = receive.size if few else 1  # how large the next is nobody knows
             asked_ns = time.time_ns()
-            datagrams = receive.receive(fd)
+            datagrams = receive.receive(fd, most)
             for data, sockaddr, stamp in datagrams:
                 flow = self.flow_from(sockaddr)
                 if stamp is None:
                     chunks.append(Chunk(data, time.time_ns(), flow, StampSource.USER))
                 else:
                     chunks.append(Chunk(data, stamp.ns, flow, stamp_source(stamp, asked_ns, settling=settling)))
-            if len(datagrams) < receive.size:
+                left -= len(data)
+            if len(datagrams) < most:
                 break
         return chunks
 
@@ -208,7 +213,8 @@ class UdpSocket:
 
     def _read_portable(self) -> list[Chunk]:
         chunks: list[Chunk] = []
-        for _ in range(READ_BATCHES * _PORTABLE_BATCH):
+        left = READ_BYTES
+        while left > 0 and len(chunks) < READ_DATAGRAMS:
             try:
                 data, sender = self._sock.recvfrom(_DATAGRAM_BYTES)
             except (BlockingIOError, InterruptedError):
@@ -216,6 +222,7 @@ class UdpSocket:
             key = (sender[0], sender[1])
             flow = self._flows.get(key) or self._new_flow(key, Address(self.address.family, sender))
             chunks.append(Chunk(data, time.time_ns(), flow, StampSource.USER))
+            left -= len(data)
         return chunks
 
     def _new_flow(self, key: bytes | tuple[str, int], sender: Address) -> Flow:
@@ -227,11 +234,15 @@ class UdpSocket:
     @property
     def own_drops(self) -> int | None:
         """Datagrams that this socket's full buffer has lost since it was opened (32 bits, wraps); None if unknown."""
+        return self._meminfo(linux.MEMINFO_DROPS)
+
+    def _meminfo(self, place: int) -> int | None:
+        """One of the numbers of SO_MEMINFO; None where the system has none."""
         try:
             info = self._sock.getsockopt(socket.SOL_SOCKET, linux.SO_MEMINFO, 36) if linux.NATIVE else b""
         except OSError:
             return None
-        return int(struct.unpack_from("=I", info, 4 * linux.MEMINFO_DROPS)[0]) if len(info) == 36 else None
+        return int(struct.unpack_from("=I", info, 4 * place)[0]) if len(info) == 36 else None
 
     def newly_dropped(self) -> int:
         """Own drops since this was last asked; those that are not known are 0."""

@@ -93,6 +93,31 @@ def test_datagrams_carry_nothing_over() -> None:
     assert accounted(items) == len(FRAMES[1])
 
 
+@pytest.mark.parametrize("bad", [FRAMES[1][:-1] + b"?", b"\xaa\x01\x00\x03" + FRAMES[0][4:], b"\xaa\x71" + bytes(40)])
+def test_good_frames_behind_a_bad_one_of_their_datagram_are_found(bad: bytes) -> None:
+    items = Framer(streaming=False).feed(bad + FRAMES[0] + FRAMES[1])
+    assert frames_of(items) == FRAMES[:2] and accounted(items) == len(bad + FRAMES[0] + FRAMES[1])
+
+
+@pytest.mark.parametrize("shape", [b"\xaa\x01\x40\x00", b"\xaa\x01\xff\xff", b"\xaa\x01\x00\x00", b"\xaa", b"\xaa\x71"])
+def test_a_datagram_of_false_frames_costs_a_few_checks(monkeypatch: pytest.MonkeyPatch, shape: bytes) -> None:
+    """Of 65,507 bytes, where each few may begin a frame: not as many checks as there are places."""
+    checks = 0
+
+    def counted(data: bytes) -> int:
+        nonlocal checks
+        checks += 1
+        return chk(data)
+
+    monkeypatch.setattr(framer_module, "chk", counted)
+    hostile = (shape * 65_507)[:65_507]
+    framer = Framer(streaming=False)
+    items = framer.feed(FRAMES[0] + hostile) + framer.feed(FRAMES[1])
+    assert frames_of(items) == FRAMES[:2] and len(items) == 3, "one run of bytes, and the next datagram is read"
+    assert accounted(items) == len(FRAMES[0] + hostile + FRAMES[1])
+    assert checks <= 2 + framer_module.TRIES
+
+
 def test_a_hole_ends_what_was_pending() -> None:
     framer = Framer(streaming=True)
     items = framer.feed(FRAMES[1][:10]) + framer.feed(FRAMES[0], lost_before=100)

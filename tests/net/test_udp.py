@@ -75,6 +75,24 @@ def test_kernel_stamps_do_not_depend_on_when_they_are_read() -> None:
     sender.close()
 
 
+@paths
+def test_a_flood_of_large_datagrams_has_its_turn_by_bytes(native: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All come, in order; small ones many at a time."""
+    monkeypatch.setattr(udp, "READ_BYTES", 8192)
+    receiver, sender = UdpSocket("127.0.0.1", 0, native=native), UdpSocket("127.0.0.1", 0)
+    where = target(receiver.address)
+    assert sender.send([bytes(4000)] * 12, [where] * 12) == []
+    rounds = [receiver.read() for _ in range(12)]
+    assert sum(map(len, rounds)) == 12 and max(map(len, rounds)) <= 3
+    frames = [bytes([k]) * 20 for k in range(200)]
+    assert sender.send(frames, [where] * 200) == []
+    rounds = [receiver.read() for _ in range(20)]
+    assert [chunk.data for chunks in rounds for chunk in chunks] == frames
+    assert max(map(len, rounds)) >= 64
+    receiver.close()
+    sender.close()
+
+
 @native_only
 def test_own_drops_account_for_every_datagram() -> None:
     receiver, sender = UdpSocket("127.0.0.1", 0, rcvbuf_bytes=4096), UdpSocket("127.0.0.1", 0)

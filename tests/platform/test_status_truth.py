@@ -53,7 +53,7 @@ def test_what_a_flood_brings_that_is_no_frame_is_counted_and_shown(
 
     def counted(status: dict[str, Any]) -> bool:
         more = {name: value - before[name] for name, value in status["counts"].items() if value != before[name]}
-        more.pop("unneeded", None)  # the player repeats its configurations
+        more.pop("repeated", None)  # the player repeats its configurations
         return more.pop("own_drops", 0) + sum(more.values()) == 6000 and set(more) <= {"undecodable", "foreign"}
 
     status = site.until(counted, "each datagram counted")
