@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from dcon.control import hanging
+from dcon.control.hanging import Silences, hung, look
 from dcon.control.news import Heard, counted, hear, is_there, surroundings, watchdog_of
 from dcon.control.ports import Ends, Told
 from dcon.core.values import Order
@@ -117,11 +119,12 @@ class WatchdogCommand:
 
 
 class RunNews:
-    """``control.in``, and whether the processes that this one has started are there still."""
+    """``control.in``, and whether the processes that this one has started are there still, and beat."""
 
     def __init__(self, sock: socket.socket, children: Children, command: WatchdogCommand, heard: Heard) -> None:
         self._sock, self._children, self._command = sock, children, command
         self._orders: list[Order] = []
+        self._silences = Silences(heard.started_ns)
         self.heard = heard
 
     def listen(self, now_ns: int) -> None:
@@ -139,7 +142,8 @@ class RunNews:
         self.listen(now_ns)
         orders, self._orders = tuple(self._orders), []
         around = surroundings(self.heard, now_ns, self._command.sent_ns)
-        return Told(orders, around, self._children.trouble())
+        self._silences = look(self._silences, self.heard, now_ns)
+        return Told(orders, around, self._children.trouble() or hung(self._silences, hanging.HUNG_NS))
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -18,8 +18,14 @@ from dcon.session.codec import Watchdog
 
 GPS_NS = 3_000_000_000
 """A lock that nobody has spoken of for so long is getting old."""
-HELPERS = (LoopName.UDP, LoopName.PARSE, LoopName.GPS, LoopName.GUI, LoopName.PDCI)
-"""Loops of the control process's children."""
+HELPERS = {
+    LoopName.UDP: "front",
+    LoopName.PARSE: "front",
+    LoopName.GPS: "aides",
+    LoopName.GUI: "aides",
+    LoopName.PDCI: "aides",
+}
+"""Loops of the control process's children, and whose each is."""
 BEATING_MS = 250.0
 """Those of an earlier life are older: a process is started again after so long, and takes its time."""
 SERVER_NS = 3_000_000_000

@@ -8,8 +8,6 @@ from pathlib import Path
 from dcon.link import paths
 from dcon.link.notify import READY
 
-HUNG_S = 10.0
-"""A process that has been ready, and says nothing for so long, hangs: the ``WatchdogSec`` of the units."""
 DATAGRAM_BYTES = 4096
 
 

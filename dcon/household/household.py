@@ -23,9 +23,9 @@ from types import FrameType
 from typing import NamedTuple
 
 from dcon.household.backoff import Backoff
-from dcon.household.ear import HUNG_S, Ear
+from dcon.household.ear import Ear
 from dcon.link import paths
-from dcon.link.children import ending, launch
+from dcon.link.children import HUNG_S, ending, launch
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from pmutools.errors import SourceError
 

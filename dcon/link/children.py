@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import subprocess
 import sys
@@ -11,7 +12,10 @@ from types import FrameType
 
 from pmutools import linux
 
+LOG = logging.getLogger(__name__)
 PATIENCE_S = 3.0
+HUNG_S = 10.0
+"""A process that has been heard, and says nothing for so long, hangs: the ``WatchdogSec`` of the units."""
 
 
 def launch(
@@ -68,8 +72,11 @@ class Children:
     def close(self) -> None:
         for process in self.processes.values():
             process.kill()  # they hold nothing that an orderly end would save
-        for process in self.processes.values():
-            process.wait(PATIENCE_S)
+        for name, process in self.processes.items():
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:  # a disk holds it: it ends when that lets it go
+                LOG.error("the %s process was killed, and is still there after %g s", name, PATIENCE_S)
         signal.signal(signal.SIGCHLD, self._before)
 
     def _ring(self, signum: int, frame: FrameType | None) -> None:

@@ -10,12 +10,12 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 from support.live import free_ports, free_udp_port
-from support.running import descendants
+from support.running import command_line, descendants
 from support.swing import Streams
 
 from dcon.link.paths import CONTROL, bind_datagram, is_held, prepare
@@ -83,6 +83,43 @@ def test_it_ends_when_asked_to_while_it_still_waits_for_the_watchdog(tmp_path: P
     while any(Path(f"/proc/{pid}").exists() for pid in mine):
         assert time.monotonic() < end_s
         time.sleep(0.02)
+
+
+IMPATIENT = """
+import sys
+from dcon.control import hanging
+hanging.HUNG_NS = 1_000_000_000
+from dcon.cli import main
+main()
+"""
+"""``dcon``, to whose controller a child hangs after a second."""
+
+
+@pytest.mark.parametrize(("module", "words"), [("dcon.front", "front process hangs"), ("dcon.aides", "aides process")])
+def test_a_child_that_stands_still_ends_it_and_is_killed(module: str, words: str, tmp_path: Path) -> None:
+    urls = [f"udp://127.0.0.1:{free_udp_port()}" for _ in NAMES]
+    (tmp_path / "site.ini").write_text(Streams(NAMES).ini(urls=urls, extra=QUIET + "[watchdog]\nfifo = no\n"))
+    both = ["--ini", str(tmp_path / "site.ini"), "--run-dir", str(prepare(tmp_path / "run"))]
+    notify = tmp_path / "notify"
+    with ExitStack() as stack:
+        ready = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        ready.bind(str(notify))
+        ready.settimeout(30)
+        watchdog = subprocess.Popen([sys.executable, "-m", "dcon.cli", "watchdog", *both], stderr=subprocess.DEVNULL)
+        stack.callback(watchdog.wait, 10)
+        stack.callback(watchdog.kill)
+        environment = {**os.environ, "NOTIFY_SOCKET": str(notify)}
+        command = [sys.executable, "-c", IMPATIENT, "platform", *both]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+        stack.callback(process.kill)
+        assert b"READY=1" in ready.recv(4096)  # the watchdog is healthy: front and aides have beaten
+        mine = list(descendants(process.pid))
+        (child,) = [pid for pid in mine if module in command_line(pid)]
+        os.kill(child, signal.SIGSTOP)
+        code, err = said(process)
+        assert code == 1 and err.splitlines()[-1].startswith(f"dcon: the {words}")
+        assert err.splitlines()[-1].endswith("has not beaten for 1 s")
+        assert not any(Path(f"/proc/{pid}").exists() for pid in mine)
 
 
 def test_a_stderr_that_nobody_reads_stops_no_tick(tmp_path: Path) -> None:
