@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError
 
-from dcon.core.rows import CORE
-from dcon.core.values import Event, InstanceState, Order
+from dcon.core.values import Event, InstanceState, Order, Surroundings
 from dcon.link.bundle import Bundle, Entry
 from dcon.link.counts import total
+from dcon.server.around import NO_LINE, LineSource, line_of, text_of
 from dcon.server.told import shown
 from dcon.session import codec
 from dcon.session.head import Head
@@ -22,7 +22,6 @@ EVENTS = 50
 """The last that are told."""
 MOST_FLAGS = 1000
 """Entries of the flag register that are kept."""
-TEXTS = {row.name: row.text for row in CORE.rows}
 WELL = (InstanceState.READY, InstanceState.HELD)
 SHOWN = frozenset(
     ("Tick", "Instance", "Event", "Flag", "Setting", "Surroundings", "Pdci", "Watchdog", "Timing", "Counts")
@@ -44,8 +43,10 @@ class News(NamedTuple):
 class Newest:
     """The last tick, the flag register and the last events of a session. Memory: bounded by the numbers above."""
 
-    def __init__(self, head: Head) -> None:
+    def __init__(self, head: Head, source: LineSource = NO_LINE) -> None:
+        """``source`` of the line's status."""
         self.head = head
+        self._source = source
         self.tick_ns = 0
         self.ticks = 0
         self.undecodable = 0
@@ -80,9 +81,17 @@ class Newest:
 
     def status(self, utc_ns: int, is_old: bool) -> dict[str, Any]:
         """For operators at ``utc_ns``; what is not known is None. ``is_old``: no ticks come any more."""
-        tick, told = self._last.get("Tick"), self._last.get("Surroundings")
+        tick, message = self._last.get("Tick"), self._last.get("Surroundings")
         if tick is None:
-            return {"state": None, "flags": [], "instances": [], "pmus": [], "events": [], "watchdog": None}
+            none: dict[str, Any] = {"flags": [], "instances": [], "pmus": [], "events": []}
+            return {
+                "state": None,
+                **none,
+                "watchdog": None,
+                "line": line_of(self._source, None, utc_ns),
+                "counts": None,
+            }
+        told = None if message is None else codec.decode_surroundings(message)
         names, active = self.head.instances, tick.active
         return {
             "tick_ns": tick.tick_ns,
@@ -94,15 +103,15 @@ class Newest:
             "command_mw": tick.command_mw,
             "output_v": tick.output_v,
             "probe_mw": tick.probe_mw,
-            "flags": self._flags_up(tick.flags),
+            "flags": self._flags_up(tick, told),
             "instances": self._instances(),
             "pmus": [
                 {"name": name, "age_ms": age, "f_hz": f}
                 for name, age, f in zip(self.head.pmus, tick.age_ms, tick.f_hz, strict=False)
             ],
             "watchdog": self._watchdog(utc_ns, is_old),
-            "surroundings": None if told is None else _surroundings(told),
-            "line": self._line(),
+            "surroundings": None if told is None else _shown(told),
+            "line": line_of(self._source, self._last.get("Pdci"), utc_ns),
             "timing": self._timing(),
             "counts": self._counts(),
             "events": list(self._events),
@@ -122,14 +131,15 @@ class Newest:
         if len(self._flags) > MOST_FLAGS:
             self._flags.pop(next(iter(self._flags)))
 
-    def _flags_up(self, bits: int) -> list[dict[str, Any]]:
+    def _flags_up(self, tick: Any, told: Surroundings | None) -> list[dict[str, Any]]:
         """Those that are up, or latched; of the checks that are up and were not heard of, the name alone."""
+        line = line_of(self._source, self._last.get("Pdci"), tick.tick_ns)
         known = [flag for flag in self._flags.values() if flag.up or flag.latched]
         shown = [
             {
                 "name": flag.name,
                 "subject": flag.subject,
-                "text": TEXTS.get(flag.name, ""),
+                "text": text_of(flag.name, told, line),
                 "up": flag.up,
                 "latched": flag.latched,
                 "acknowledged": flag.acknowledged,
@@ -142,8 +152,8 @@ class Newest:
         ]
         heard = {flag.name for flag in known}
         for place, name in enumerate(self.head.flags):
-            if bits >> place & 1 and name not in heard:
-                shown.append({"name": name, "subject": "", "text": TEXTS.get(name, ""), "up": True})
+            if tick.flags >> place & 1 and name not in heard:
+                shown.append({"name": name, "subject": "", "text": text_of(name, told, line), "up": True})
         return shown
 
     def _instances(self) -> list[dict[str, Any]]:
@@ -180,18 +190,6 @@ class Newest:
             beats_ms=dict(zip(watchdog.heartbeat, watchdog.heartbeat_age_ms, strict=False)),
         )
 
-    def _line(self) -> dict[str, Any] | None:
-        line = self._last.get("Pdci")
-        if line is None:
-            return None
-        return {
-            "time_ns": line.time_ns,
-            "power_mw": line.power_mw,
-            "scheduled_mw": line.scheduled_mw,
-            "in_service": line.in_service,
-            "dcon_enabled": line.dcon_enabled,
-        }
-
     def _counts(self) -> dict[str, int] | None:
         counts = self._last.get("Counts")
         return None if counts is None else total(dict(zip(counts.name, counts.value, strict=False)))
@@ -203,9 +201,8 @@ class Newest:
         return {"compute_us": timing.compute_us, "late_us": timing.late_us}
 
 
-def _surroundings(message: Any) -> dict[str, Any]:
-    told = codec.decode_surroundings(message)._asdict()
-    return {name: value for name, value in told.items() if name not in ("pdci", "unread")}
+def _shown(told: Surroundings) -> dict[str, Any]:
+    return {name: value for name, value in told._asdict().items() if name not in ("pdci", "unread")}
 
 
 def _finite(value: Any) -> Any:

@@ -20,6 +20,7 @@ from dcon.link.keys import read_keys
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
+from dcon.server.around import LineSource
 from dcon.server.desk import Desk
 from dcon.server.newest import Newest, to_json
 from dcon.server.operators import Operators
@@ -69,7 +70,10 @@ class Server:
         keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
         # it remembers no sequences of an earlier life: what was signed before this one is not told to the watchdog
         verifier = Verifier(keys, window_ns=round(settings.server.window_s * NS), floor_ns=self.clock.realtime_ns())
-        self.newest = Newest(Head(""))
+        self._line = LineSource(
+            settings.line_input.url is not None or settings.params.line.required, settings.params.line.status_age_s
+        )
+        self.newest = Newest(Head(""), self._line)
         self.response = LineResponse()
         self.report = Report()
         self.failures = 0
@@ -152,7 +156,7 @@ class Server:
             "log": {
                 "file": report.file,
                 "parts": len(report.paths),
-                "lag_s": (now_ns - report.tick_ns) / NS if report.tick_ns else None,
+                "lag_s": (now_ns - report.tick_ns) / NS if report.file and report.tick_ns else None,
                 "waiting_bytes": self._scribe.waiting,
                 "gaps": report.gaps,
                 "unlogged_ticks": report.unlogged,
@@ -264,7 +268,7 @@ class Server:
         if is_new:
             self._assembly.begin(Place(pieces.session))
         if is_new or head != self.newest.head:
-            self.newest = Newest(head)
+            self.newest = Newest(head, self._line)
             self._lag_ns = None
             self.response = LineResponse()
 

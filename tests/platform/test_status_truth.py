@@ -45,7 +45,7 @@ def test_what_a_flood_brings_that_is_no_frame_is_counted_and_shown(
     site.in_state("STANDBY")
     rng = random.Random(1)
     (frame,) = frames_now("N1", 1)
-    before = site.status()["counts"]
+    before = site.until(lambda now: now["counts"] and not now["counts"]["held"], "its configurations")["counts"]
     with flood(site.ports[0], [rng.randbytes(60), b"", frame[:-1], frame[:20] + b"?" + frame[21:]], 0.5):
         pass
     with flood(site.ports[0], [frame, rng.randbytes(60)], 0.1, source="127.0.0.2"):
@@ -66,6 +66,8 @@ def test_a_controller_that_stands_still(site: Running, capsys: pytest.CaptureFix
     site.activate()
     lines = shown(site, capsys)
     assert lines[0].startswith("ACTIVE, closed_loop") and any(line.startswith("relays closed") for line in lines)
+    (line,) = [line for line in lines if line.startswith("line ")]
+    assert "2000.0 MW scheduled, in service, accepts the command; 0." in line
     site.kill("platform", signal.SIGSTOP)
     try:
         status = site.until(lambda now: now["tick_age_ms"] > 1000, "an old tick")
@@ -74,7 +76,8 @@ def test_a_controller_that_stands_still(site: Running, capsys: pytest.CaptureFix
         assert watchdog["source"] == "watchdog" and watchdog["age_ms"] < 100
         assert watchdog["latched"] and watchdog["relays_closed"] is False and "control" in watchdog["causes"]
         lines = shown(site, capsys)
-        assert lines[0].startswith("OLD, by ") and lines[1].startswith("last known: ACTIVE")
+        assert lines[0].startswith("OLD, by ") and ", and the watchdog has TRIPPED: " in lines[0]
+        assert lines[1].startswith("last known: ACTIVE")
         assert any(line.startswith("relays open; tripped; causes: ") for line in lines)
         assert not any("relays closed" in line for line in lines)
     finally:
