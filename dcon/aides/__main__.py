@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import signal
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from dcon.aides.crew import aides, work
 from dcon.link import paths
+from dcon.link.crossing import Failure
 from dcon.settings import load
 from pmutools import linux
 from pmutools.errors import PmuError
@@ -27,14 +29,19 @@ def main(arguments: list[str]) -> int:
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
+    failure: Failure | None = None
     try:
         with log_in_thread():  # a stuck reader of what is logged must not hold up the beats
-            failure = work(aides(load(given.ini), paths.prepare(given.run_dir)), stopping.is_set)
+            if reason := work(aides(load(given.ini), paths.prepare(given.run_dir)), stopping.is_set):
+                failure = Failure(reason)
     except PmuError as error:
-        failure = str(error)
-    if failure:
-        sys.stderr.write(f"aides: {failure}\n")
-    return 1 if failure else 0
+        failure = Failure.of(error)
+    if failure is None:
+        return 0
+    told = json.dumps({"kind": "failed", **failure._asdict()}).encode()
+    if not paths.Sender(given.run_dir / paths.CONTROL).send(told):  # else who has started this one says it
+        sys.stderr.write(f"aides: {failure.reason}\n")
+    return 1
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def command(
     if sys.platform != "linux":
         raise SettingsError("dcon run needs Linux; dcon platform alone runs elsewhere too")
     from dcon.effective import warnings_of
-    from dcon.household.household import Household
+    from dcon.household.household import Household, NotStarted
     from dcon.link.notify import Notifier
     from dcon.settings import load
     from pmutools.log_thread import log_in_thread
@@ -78,8 +78,13 @@ def command(
         commands = _commands(settings, ini, folder, flags, timed)
         household = Household(folder, commands, Notifier(), is_over)
         with household.stopped_by_signals(), log_in_thread():  # who looks after others waits for no reader of stderr
-            outcome = household.run()
-    summary = _summary(outcome.said, before)
+            try:
+                outcome = household.run()
+            except NotStarted as error:
+                if not error.is_told:
+                    raise
+                return error.code
+    summary = _summary(outcome.said)
     missing = summary.get("unlogged_ticks", 0)
     restarts = sum(outcome.restarts.values())
     if as_json:

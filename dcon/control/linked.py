@@ -72,10 +72,10 @@ class PairFrames:
         return items
 
     def keep(self) -> None:
-        """Take what is there now, for the first tick. Raises SourceError where the front could not start."""
+        """Take what is there now, for the first tick. Raises PmuError where the front could not start."""
         for item in self._drained():
             if isinstance(item, Failure):
-                raise SourceError(item.reason)
+                raise item.error
             self._early.append(item)
 
     def _drained(self) -> Iterable[Item]:
@@ -143,7 +143,11 @@ class RunNews:
         orders, self._orders = tuple(self._orders), []
         around = surroundings(self.heard, now_ns, self._command.sent_ns)
         self._silences = look(self._silences, self.heard, now_ns)
-        return Told(orders, around, self._children.trouble() or hung(self._silences, hanging.HUNG_NS))
+        return Told(orders, around, self.trouble() or hung(self._silences, hanging.HUNG_NS))
+
+    def trouble(self) -> str:
+        """Why a child has ended, in its own words where it had some; "" while all are there."""
+        return self._children.trouble() if self.heard.failed is None else self.heard.failed.reason
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -236,8 +240,7 @@ class Linked:
         """Drive 0 V and beat until the watchdog finds everybody well, so that the first tick finds it healthy.
 
         One that has tripped waits for an operator, and so would this; where it takes too long the session begins
-        without, and shows it. Raises SourceError where the front or the
-        aides cannot start.
+        without, and shows it. Raises PmuError where the front or the aides cannot start.
         """
         clock = self._clock
         now_ns = clock.monotonic_ns()
@@ -246,9 +249,10 @@ class Linked:
             self._command.send(clock.realtime_ns(), 0.0)
             self._frames.keep()
             self._news.listen(now_ns)
-            if trouble := self._children.trouble():
-                self._frames.keep()  # its last words
-                raise SourceError(trouble)
+            if trouble := self._news.trouble():
+                self._frames.keep()  # the front's last words
+                self._news.listen(now_ns)
+                raise SourceError(trouble) if (failed := self._news.heard.failed) is None else failed.error
             if is_there(self._news.heard, now_ns):
                 return
             if now_ns >= end_ns:

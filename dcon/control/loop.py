@@ -36,7 +36,7 @@ from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.c37118 import Frame, decode_config
 from pmutools.clock import Clock, UtcOffset, utc_offset
-from pmutools.errors import SettingsError, SourceError, WireError
+from pmutools.errors import SettingsError, WireError
 from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.realtime import go_realtime
 from pmutools.timebase import NS
@@ -257,8 +257,8 @@ class Platform:
                     self._waiting.add_config(sites[pmu].name, frame)
                 case LinkEvent():
                     self._tell(item)
-                case Failure(reason):
-                    raise SourceError(reason)
+                case Failure():
+                    raise item.error
 
     def _tell(self, news: LinkEvent) -> None:
         self._told[news.kind] += 1

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import LoopName, Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
 from dcon.link.counts import COUNTS, total
+from dcon.link.crossing import Failure
 from dcon.session.codec import Watchdog
 
 GPS_NS = 3_000_000_000
@@ -57,6 +58,8 @@ class Heard(NamedTuple):
     server: Server | None = None
     ignored: int = 0
     """Datagrams that say nothing which is known here."""
+    failed: Failure | None = None
+    """The aides have ended, by their own word."""
     counts: Mapping[str, Mapping[str, int]] = MappingProxyType({})
     """What each loop of the aides has counted."""
 
@@ -103,9 +106,7 @@ def _pdci(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
 
 def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
     name, text, who, why = (said.get(key, "") for key in ("name", "text", "who", "why"))
-    if not all(isinstance(word, str) for word in (name, text, who, why)):
-        raise TypeError("an order is words")
-    "".join((name, text, who, why)).encode()  # JSON has halves of surrogates, which no log takes
+    name, text, who, why = map(_words, (name, text, who, why))
     return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who, why))
 
 
@@ -120,13 +121,24 @@ def _counts(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
     return Said(heard._replace(counts={**heard.counts, loop: counts}))
 
 
-_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server, "counts": _counts}
+def _failed(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
+    return Said(heard._replace(failed=Failure(_words(said["reason"]), said["is_mistake"] is True)))
+
+
+_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server, "counts": _counts, "failed": _failed}
 
 
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return float(value)
+
+
+def _words(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    value.encode()  # JSON has halves of surrogates, which no log takes
+    return value
 
 
 def _count(value: object) -> int:

@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> int:
         settings = load(given.ini)
         receivers = Receivers([site.endpoint for site in settings.sites], clock)
     except PmuError as error:
-        outlet.add(Failure(str(error)))
+        outlet.add(Failure.of(error))
         outlet.flush()
         return 1
     reception = Reception(receivers, counts)

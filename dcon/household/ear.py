@@ -11,12 +11,17 @@ from dcon.link.notify import READY
 DATAGRAM_BYTES = 4096
 
 
+def ear_of(member: str) -> str:
+    """Name of the socket in the run folder at which ``dcon run`` hears a member."""
+    return f"run.{member}"
+
+
 class Ear:
     """Hears one member, life after life. Raises SourceError where its socket cannot be had."""
 
     def __init__(self, folder: Path, member: str) -> None:
-        self._sock = paths.bind_datagram(folder, f"run.{member}")
-        self.path = str(folder / f"run.{member}")
+        self._sock = paths.bind_datagram(folder, ear_of(member))
+        self.path = str(folder / ear_of(member))
         """For the member's ``NOTIFY_SOCKET``."""
         self.is_ready = False
         """In this life."""

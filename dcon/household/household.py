@@ -23,7 +23,8 @@ from types import FrameType
 from typing import NamedTuple
 
 from dcon.household.backoff import Backoff
-from dcon.household.ear import Ear
+from dcon.household.ear import Ear, ear_of
+from dcon.household.places import await_places
 from dcon.link import paths
 from dcon.link.children import HUNG_S, ending, launch
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
@@ -34,12 +35,23 @@ START_S = 30.0
 """For a process to be ready, on a busy machine: the controller may wait 10 s for the watchdog."""
 ROUND_S = 1.0
 """The longest between two rounds: so often systemd is told that all is well."""
-USAGE = 2
-"""Exit code of a process that was set up wrongly: it would be the same again."""
-MOST_SAID = 256
-"""Lives of one process whose last words are kept."""
+FAILED, USAGE = 1, 2
+"""Exit codes of a process that has said why; of the latter it was set up wrongly, and would be the same again."""
 DONE = (0, 3)
 """Exit codes of a controller whose time is over."""
+
+
+class NotStarted(SourceError):
+    """A process ended before it was ready, with the exit code ``code``."""
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the process has said why itself, in a line of its own."""
+        return self.code in (FAILED, USAGE)
 
 
 class Member(NamedTuple):
@@ -136,17 +148,19 @@ class Household:
     def run(self) -> Outcome:
         """Until the controller's time is over, or :meth:`stop`.
 
-        Raises SourceError where a process cannot start, or one that runs already has its place.
+        Raises SourceError where a process cannot start, or one that runs already keeps its place.
         """
         needed = [member for member in STARTED if member.name in self._commands]
-        for member in needed:
-            path = self.folder / member.inbox
-            if paths.is_held(path, member.kind):
-                raise SourceError(
-                    f"{path}: another process that is running has it; end that, or take another run folder"
-                )
+        await_places(
+            [self.folder / ear_of(of.name) for of in needed],
+            [(self.folder / of.inbox, of.kind) for of in needed],
+            lambda: self.stopping,
+            lambda seconds: self._poll.poll(1000 * seconds),
+        )
         try:
             for member in needed:
+                if self.stopping or self._over:
+                    break
                 each = self._running[member.name] = _Running(member, Ear(self.folder, member.name))
                 each.ear.register(self._poll)
                 self._start(each)
@@ -257,7 +271,7 @@ class Household:
         if each.member is PLATFORM and (code in DONE or self._is_over() or is_mistake):
             self._over = True
         elif not each.was_ready:
-            raise SourceError(f"the {each.member.name} process could not start, {ending(code)}")
+            raise NotStarted(f"the {each.member.name} process could not start, {ending(code)}", code)
         else:
             self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
 

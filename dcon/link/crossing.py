@@ -17,6 +17,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 from pmutools.c37118 import Frame
+from pmutools.errors import PmuError, SettingsError, SourceError
 from pmutools.flow import StampSource
 from pmutools.net.dialogue import LinkEvent, LinkKind
 
@@ -39,7 +40,7 @@ class Kind(IntEnum):
     COUNTS = 3
     """:class:`Counts` so far, as JSON."""
     FAILED = 4
-    """The front cannot go on: why, as text."""
+    """:class:`Failure`, as JSON: the front cannot go on."""
 
 
 @dataclass
@@ -67,9 +68,19 @@ class PmuFrameIn(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """The front has ended, and why."""
+    """The front, or the aides, have ended, and why."""
 
     reason: str
+    is_mistake: bool = False
+    """Of a file that a user wrote: it would be the same again."""
+
+    @classmethod
+    def of(cls, error: PmuError) -> Failure:
+        return cls(str(error), isinstance(error, SettingsError))
+
+    @property
+    def error(self) -> PmuError:
+        return SettingsError(self.reason) if self.is_mistake else SourceError(self.reason)
 
 
 Item = PmuFrameIn | LinkEvent | Counts | Failure
@@ -105,8 +116,8 @@ def _record(item: Item) -> bytes:
             return _text(Kind.NEWS, json.dumps(said))
         case Counts():
             return _text(Kind.COUNTS, json.dumps(asdict(item)))
-        case Failure(reason):
-            return _text(Kind.FAILED, reason)
+        case Failure():
+            return _text(Kind.FAILED, json.dumps(item))
 
 
 def _text(kind: Kind, text: str) -> bytes:
@@ -131,18 +142,19 @@ def decode(message: bytes) -> Iterator[Item]:
             if source >= len(_SOURCES):
                 raise ValueError(f"no stamp source {source}")
             yield PmuFrameIn(pmu, Frame(data, arrival_ns, _SOURCES[source], 0), kind == Kind.CONFIG)
-        elif kind in (Kind.NEWS, Kind.COUNTS):
+        elif kind <= Kind.FAILED:
             try:
                 yield _said(kind, json.loads(data))
             except (KeyError, TypeError, AttributeError, OverflowError) as error:
                 raise ValueError(f"a record that says nothing: {error}") from None
-        elif kind == Kind.FAILED:
-            yield Failure(data.decode(errors="replace"))
         else:
             raise ValueError(f"no record of kind {kind}")
 
 
-def _said(kind: Kind, said: dict[str, Any]) -> LinkEvent | Counts:
+def _said(kind: Kind, said: Any) -> LinkEvent | Counts | Failure:
+    if kind == Kind.FAILED:
+        reason, is_mistake = said
+        return Failure(str(reason), is_mistake is True)
     if kind == Kind.NEWS:
         return LinkEvent(**said | {"kind": LinkKind(said["kind"]), "owners": ()})
     return Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})

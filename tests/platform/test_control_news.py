@@ -10,11 +10,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from dcon.control.news import GPS_NS, SERVER_NS, Heard, hear, is_healthy, is_there, surroundings, watchdog_of
+from dcon.control.news import GPS_NS, SERVER_NS, Heard, counted, hear, is_healthy, is_there, surroundings, watchdog_of
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import UNHEARD, Readback, WatchdogState, encode_readback
-from dcon.session.codec import Watchdog, encode_order, encode_pdci, encode_surroundings
+from dcon.link.counts import COUNTS
+from dcon.session.codec import Watchdog, encode_counts, encode_order, encode_pdci, encode_surroundings
 from dcon.watchdog.codec import encode_status
+from pmutools.errors import SettingsError, SourceError
 
 T0 = 10**12
 STATUS_NS = 100_000_000
@@ -156,6 +158,19 @@ BAD = [
     *(json.dumps({"kind": "order", "name": "arm", word: "\ud800"}).encode() for word in ("name", "text", "who", "why")),
     encode_readback(Readback(1, T0, math.nan)),
     json.dumps({"kind": "gps", "age_s": -1.0}).encode(),
+    *(
+        json.dumps({"kind": "counts", **said}).encode()
+        for said in (
+            {"loop": "gui"},
+            {"loop": "nobody", "counts": {}},
+            {"loop": "gui", "counts": {"untold": -1}},
+            {"loop": "gui", "counts": {"untold": True}},
+            {"loop": "gui", "counts": {"untold": 1 << 63}},
+            {"loop": "gui", "counts": [1]},
+        )
+    ),
+    json.dumps({"kind": "failed", "reason": "\ud800", "is_mistake": True}).encode(),
+    json.dumps({"kind": "failed", "reason": "why"}).encode(),
     b'{"kind":"order","name":"gain","value":1' + 400 * b"0" + b"}",
     b"",
     b"{}",
@@ -184,6 +199,23 @@ def test_what_makes_no_sense_is_counted_and_changes_nothing(datagram: bytes) -> 
     before = heard((T0, status(T0)), (T0, SERVER))
     after, order = hear(before, datagram, T0)
     assert after == before._replace(ignored=1) and order is None
+
+
+def test_counts_are_the_newest_of_each_loop_added_up() -> None:
+    def said(loop: str, **counts: int) -> tuple[int, dict[str, Any]]:
+        return T0, {"kind": "counts", "loop": loop, "counts": counts}
+
+    now = heard((T0, b""), said("gui", untold=7), said("gui", untold=1, orders_lost=3, what=9), said("pdci", untold=2))
+    assert counted(now) == {**dict.fromkeys(COUNTS, 0), "news_ignored": 1, "untold": 3, "orders_lost": 3}
+    encode_counts(T0, counted(now))
+
+
+def test_the_aides_say_why_they_have_ended() -> None:
+    now = heard((T0, {"kind": "failed", "reason": "keys.ini:2: key: too short", "is_mistake": True}))
+    assert now.failed is not None and isinstance(now.failed.error, SettingsError)
+    assert str(now.failed.error) == "keys.ini:2: key: too short"
+    other = heard((T0, {"kind": "failed", "reason": "a port", "is_mistake": False})).failed
+    assert other is not None and isinstance(other.error, SourceError)
 
 
 VALUES = st.integers() | st.floats() | st.text() | st.booleans() | st.none() | st.sampled_from([1 << 63, (1 << 63) - 1])

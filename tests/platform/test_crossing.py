@@ -27,7 +27,7 @@ NEWS = st.builds(
     LinkEvent, st.sampled_from(list(LinkKind)), WORDS, st.just(()), WORDS, st.none(), st.none(), st.integers(0, 99)
 )
 COUNTS = st.builds(Counts, *[st.integers(0, 1 << 40)] * 4)
-ITEMS = st.lists(st.one_of(FRAMES, NEWS, COUNTS, st.builds(Failure, WORDS)), max_size=20)
+ITEMS = st.lists(st.one_of(FRAMES, NEWS, COUNTS, st.builds(Failure, WORDS, st.booleans())), max_size=20)
 
 
 @given(ITEMS)

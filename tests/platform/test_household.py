@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from dcon.household import household
-from dcon.household.household import ENDED, STARTED, Household
+from dcon.household import household, places
+from dcon.household.household import ENDED, STARTED, Household, NotStarted
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, bind_datagram, prepare
 from pmutools.errors import SourceError
@@ -41,7 +41,8 @@ sock = socket.socket(socket.AF_UNIX, int(kind))
 sock.bind(path)
 if int(kind) == socket.SOCK_SEQPACKET: sock.listen(8)
 note("start")
-def tell(what): socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(what, os.environ["NOTIFY_SOCKET"])
+teller = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)  # kept: an exit from within a destructor is none
+def tell(what): teller.sendto(what, os.environ["NOTIFY_SOCKET"])
 if deaf != "unready": tell(b"READY=1\\nWATCHDOG=1")
 end_s = time.monotonic() + float(life)
 while (rest_s := end_s - time.monotonic()) > 0:
@@ -191,11 +192,24 @@ def test_one_for_which_there_is_no_room_at_the_start_is_one_line(
     assert house.is_empty()
 
 
-def test_one_that_cannot_start_ends_the_others_in_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("ending", "words", "is_told"),
+    [
+        ("raise SystemExit(1)", "exit code 1", True),
+        ("raise SystemExit(2)", "exit code 2", True),
+        ("raise SystemExit(0)", "exit code 0", False),
+        ("import os; os.kill(os.getpid(), 9)", "by SIGKILL", False),
+    ],
+)
+def test_one_that_cannot_start_ends_the_others_in_one_line(
+    ending: str, words: str, is_told: bool, tmp_path: Path
+) -> None:
+    """Its own, where it had one."""
     house = House(tmp_path)
-    house.household._commands["server"] = lambda: ["-c", "raise SystemExit(1)"]  # type: ignore[index]
-    with pytest.raises(SourceError, match=r"^the server process could not start, exit code 1$"):
+    house.household._commands["server"] = lambda: ["-c", ending]  # type: ignore[index]
+    with pytest.raises(NotStarted, match=rf"^the server process could not start, {words}$") as caught:
         house.household.run()
+    assert caught.value.is_told is is_told
     assert house.events("start") == ["watchdog"] and house.is_empty()
 
 
@@ -242,9 +256,48 @@ def test_what_hangs_is_killed_and_started_again(
     assert house.is_empty()
 
 
-def test_a_second_run_in_one_folder_is_refused_and_disturbs_nobody(tmp_path: Path) -> None:
+HELD = r"control.in: another process that is running has it; end that, or take another run folder$"
+
+
+def test_a_second_run_in_one_folder_is_refused_at_once_and_disturbs_nobody(tmp_path: Path) -> None:
     house = House(tmp_path)
-    with bind_datagram(house.folder, CONTROL), pytest.raises(SourceError, match=r"control.in: another process that is"):
+    began_s = time.monotonic()
+    with (
+        bind_datagram(house.folder, CONTROL),
+        bind_datagram(house.folder, "run.platform"),
+        pytest.raises(SourceError, match=HELD),
+    ):
+        house.household.run()
+    assert house.events("start") == [] and time.monotonic() - began_s < 5
+
+
+def test_places_that_stay_taken_are_not_waited_for_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(places, "PLACES_S", 0.3)
+    house = House(tmp_path)
+    with bind_datagram(house.folder, CONTROL), pytest.raises(SourceError, match=HELD):
+        house.household.run()
+    assert house.events("start") == [] and caplog.text.count("waiting for its end, 0.3 s at most") == 1
+
+
+def test_a_run_waits_for_the_processes_of_one_that_was_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    house = House(tmp_path)
+    left = bind_datagram(house.folder, CONTROL)
+    threading.Timer(0.5, left.close).start()
+    began_s = time.monotonic()
+    house.stop_when(lambda: len(house.events("start")) == 3)
+    house.household.run()
+    first_s = float(house.log.read_text().splitlines()[0].split()[3]) / 1e9
+    assert first_s - began_s > 0.5
+    assert caplog.text.count("another process that is running has it; waiting for its end, 10 s at most") == 1
+    assert house.is_empty()
+
+
+def test_a_stop_while_it_waits_starts_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    house = House(tmp_path)
+    with bind_datagram(house.folder, CONTROL):
+        house.stop_when(lambda: "waiting" in caplog.text)
         house.household.run()
     assert house.events("start") == []
 

@@ -64,6 +64,45 @@ def test_a_port_in_use_is_the_front_s_word_in_one_line(tmp_path: Path) -> None:
     assert not is_held(tmp_path / "run" / CONTROL)
 
 
+def start_failed(folder: Path, command: str, ports: list[int], keys: str = "") -> tuple[int, str]:
+    """Exit code, and stderr without the watchdog's log."""
+    extra = f"""{QUIET}[server]
+listen = 127.0.0.1:{free_ports(1)[0]}
+{keys}
+[watchdog]
+fifo = no
+log = {folder / "watchdog.jsonl"}
+[log]
+path = {folder / "s.mcap"}
+"""
+    (folder / "site.ini").write_text(
+        Streams(NAMES).ini(urls=[f"udp://127.0.0.1:{port}" for port in ports], extra=extra)
+    )
+    arguments = [command, "--ini", str(folder / "site.ini"), "--run-dir", str(folder / "run"), "--quiet"]
+    return said(subprocess.Popen([sys.executable, "-m", "dcon.cli", *arguments], stderr=subprocess.PIPE, text=True))
+
+
+@pytest.mark.parametrize("command", ["platform", "server", pytest.param("run", marks=pytest.mark.alone)])
+def test_a_bad_key_is_one_line_and_a_user_s_mistake_whoever_reads_it(command: str, tmp_path: Path) -> None:
+    """The aides read it for the platform, and the server does for `dcon run`."""
+    keys = tmp_path / "keys.ini"
+    keys.write_text("[operator ann]\nkey = 12\n")
+    keys.chmod(0o600)
+    code, err = start_failed(tmp_path, command, [free_udp_port() for _ in NAMES], f"keys = {keys}")
+    assert (code, err.count("\n")) == (2, 1), err
+    assert err.startswith(f"dcon: {keys}:2: [operator ann] key: must be at least 32")
+
+
+@pytest.mark.alone
+def test_a_port_in_use_is_one_line_of_a_run_too(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = int(taken.getsockname()[1])
+        code, err = start_failed(tmp_path, "run", [port, free_udp_port()])
+    lines = [line for line in err.splitlines() if not line.startswith("no keys in [server]")]
+    assert code == 1 and len(lines) == 1 and f"udp://127.0.0.1:{port}: already in use" in lines[0], err
+
+
 def test_a_log_has_no_place_in_a_run_folder(tmp_path: Path) -> None:
     code, err = said(platform(tmp_path, "--log", "s.mcap"))
     assert code == 2 and "the server writes the log" in err
