@@ -158,7 +158,11 @@ PERMISSIVES: Final = (
     Permissive("watchdog_healthy", _watchdog_healthy, "the watchdog is not healthy"),
     Permissive("estop_released", _estop_released, "the emergency stop is pressed"),
     Permissive("server_there", _server_there, "the server is silent"),
-    Permissive("line_takes_it", _line_takes_it, "the line is out of service, or does not accept the command"),
+    Permissive(
+        "line_takes_it",
+        _line_takes_it,
+        "the line is out of service, does not accept the command, or its status is not known",
+    ),
     Permissive("line_has_room", _line_has_room, "the line's schedule leaves no room for the command"),
     Permissive("acknowledged", _all_acknowledged, "what disarmed or tripped last is not acknowledged"),
     Permissive("fallen", _all_fallen, "what disarmed or tripped last is acknowledged, but still up"),

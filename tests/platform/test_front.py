@@ -19,7 +19,7 @@ from support.live import free_udp_port
 from support.swing import Streams
 
 from dcon.control.linked import PairFrames, pair
-from dcon.front.front import KEPT, ROUND_NS, Front, Outlet
+from dcon.front.front import KEPT, PARSE_NS, ROUND_NS, Front, Outlet
 from dcon.front.receiving import Reception
 from dcon.link.beats import LoopName
 from dcon.link.children import launch
@@ -209,7 +209,10 @@ LARGEST = 65_507
 
 @pytest.mark.parametrize("kind", ["random", "false frames", "good frames"])
 def test_a_flood_of_large_datagrams_stops_no_beat_and_delays_nobody(rig: Rig, kind: str) -> None:
-    """Two hundred wait, or what of it the receive buffer holds; measured in the processor's time, whoever else runs."""
+    """Two hundred wait, or what of it the receive buffer holds: a turn takes ``PARSE_NS`` and one datagram more.
+
+    Measured in the processor's time, whoever else runs, and against what one datagram costs.
+    """
     rig.configure()
     rig.turns(2)
     header = encode_header(rig.streams.configs["N1"].idcode, "a device")
@@ -218,16 +221,23 @@ def test_a_flood_of_large_datagrams_stops_no_beat_and_delays_nobody(rig: Rig, ki
         "false frames": (b"\xaa\x01\x40\x00" * LARGEST)[:LARGEST],
         "good frames": header * (LARGEST // len(header)),
     }[kind]
+
+    def turn() -> tuple[int, list[bytes]]:
+        began_ns = time.thread_time_ns()
+        heard = [item.frame.data for item in rig.turn() if isinstance(item, PmuFrameIn) and item.pmu == 1]
+        return time.thread_time_ns() - began_ns, heard
+
+    one_ns = 0
+    for _ in range(3):
+        rig.sock.sendto(data, ("127.0.0.1", rig.ports[0]))
+        one_ns = max(one_ns, turn()[0])
     for _ in range(200):
         rig.sock.sendto(data, ("127.0.0.1", rig.ports[0]))
     sent = rig.send(1)
-    took_ns, heard = [], []
-    for _ in range(10):
-        began_ns = time.thread_time_ns()
-        heard += [item.frame.data for item in rig.turn() if isinstance(item, PmuFrameIn) and item.pmu == 1]
-        took_ns.append(time.thread_time_ns() - began_ns)
-    assert heard == [sent]
-    assert max(took_ns) < 100_000_000
+    turns = [turn() for _ in range(10)]
+    assert [frame for _, heard in turns for frame in heard] == [sent]
+    assert max(took_ns for took_ns, _ in turns) < 2 * PARSE_NS + 3 * one_ns
+    assert one_ns < 100_000_000, "a datagram alone stops no beat"
 
 
 def test_a_control_process_that_stands_still_is_not_waited_for_and_loses_no_configuration(rig: Rig) -> None:
