@@ -84,7 +84,7 @@ def command(
                 if not error.is_told:
                     raise
                 return error.code
-    summary = _summary(outcome.said)
+    summary = _summary(outcome.said, before)
     missing = summary.get("unlogged_ticks", 0)
     restarts = sum(outcome.restarts.values())
     if as_json:

@@ -83,6 +83,8 @@ class Summary:
     """What did not become what it was sent for (:data:`dcon.link.counts.COUNTS`)."""
     unread: dict[str, int] = field(default_factory=dict)
     """Those of the counts, by PMU."""
+    session: int = 0
+    """Number of the session at the server; 0 where this process writes the log."""
     unlogged_ticks: int = 0
     """Ticks that the log had no room for."""
     log_parts: list[str] = field(default_factory=list)
@@ -228,12 +230,12 @@ class Platform:
         for name, frame, time_ns in configs:
             log.config(name, frame, time_ns)
         names, record = self.settings.params.instance_names, tick.record
-        counts = None
+        counts, is_due = None, checkpoint.is_due(self.summary.ticks, self.settings.params.tick_hz)
         if record.tick_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns, counts = record.tick_ns, self._counts()
-        entries = tick_entries(
-            names, record, tick.readings, orders, timing=timing, counts=counts, surroundings=tick.surroundings
-        )
+        given, memory = (names, record, tick.readings, orders), tick.memory if is_due else None
+        around = tick.surroundings
+        entries = tick_entries(*given, timing=timing, counts=counts, surroundings=around, memory=memory)
         log.write(entries, record.tick_ns)
 
     def _counts(self) -> dict[str, int]:
@@ -287,7 +289,7 @@ class Platform:
         summary = self.summary
         summary.counts, summary.unread = self._counts(), dict(self.engine.unread)
         summary.final_state = str(self.engine.state.system)
-        summary.unlogged_ticks = log.unlogged_ticks
+        summary.session, summary.unlogged_ticks = log.session, log.unlogged_ticks
         summary.log_parts = list(map(str, log.parts))
 
 

@@ -37,6 +37,8 @@ ROUND_S = 1.0
 """The longest between two rounds: so often systemd is told that all is well."""
 FAILED, USAGE = 1, 2
 """Exit codes of a process that has said why; of the latter it was set up wrongly, and would be the same again."""
+MOST_SAID = 256
+"""Lives of one process whose last words are kept."""
 DONE = (0, 3)
 """Exit codes of a controller whose time is over."""
 

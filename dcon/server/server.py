@@ -71,7 +71,7 @@ class Server:
         # it remembers no sequences of an earlier life: what was signed before this one is not told to the watchdog
         verifier = Verifier(keys, window_ns=round(settings.server.window_s * NS), floor_ns=self.clock.realtime_ns())
         self._line = LineSource(
-            settings.line_input.url is not None or settings.params.line.required, settings.params.line.status_age_s
+            settings.line_input.url is not None or settings.params.required.line, settings.params.line.status_age_s
         )
         self.newest = Newest(Head(""), self._line)
         self.response = LineResponse()

@@ -31,7 +31,8 @@ def tick_entries(
 
     ``instances`` are the names that ``record.active`` counts in. ``frames`` in the order in which the controller got
     them. ``pdci`` is the line's status beside the tick; by default the one that the tick was told. ``counts`` are what
-    the platform has counted by then. Raises ValueError for a tick that is no POSIX time: a frame's tick 0 means none.
+    the platform has counted by then. With ``memory``, the engine's before the tick, it is a checkpoint. Raises
+    ValueError for a tick that is no POSIX time: a frame's tick 0 means none.
     """
     tick_ns = record.tick_ns
     if tick_ns <= 0:

@@ -199,4 +199,13 @@ MESSAGES: dict[str, MessageType] = {
             Field("value", "int64", "How many.", "", True),
         ),
     ),
+    "Checkpoint": MessageType(
+        "/dcon/checkpoint",
+        "All that the controller remembered before a tick, now and then: a replay can begin with it.",
+        (
+            _TICK,
+            Field("layout", "string", "What the numbers of memory are of: only a program with the same reads it."),
+            Field("memory", "string", "Nested lists as JSON, with NaN and Infinity; every number is exact."),
+        ),
+    ),
 }

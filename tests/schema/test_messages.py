@@ -87,7 +87,7 @@ def test_proto_text_and_descriptors_agree() -> None:
 
 def test_all_topics_are_there() -> None:
     dcon = {f"/dcon/{name}" for name in ("tick", "instance", "event", "setting", "watchdog", "timing", "pdci")}
-    added = {"/dcon/flag", "/dcon/surroundings", "/dcon/counts"}
+    added = {"/dcon/flag", "/dcon/surroundings", "/dcon/counts", "/dcon/checkpoint"}
     assert {message.topic for message in MESSAGES.values()} == {"/pmu/NAME/frame"} | dcon | added
 
 
