@@ -514,7 +514,8 @@ REQUIRED: dict[tuple[str, str], tuple[str, tuple[str, ...], Surroundings, str]] 
         "disarm",
         ("line_out", "line_refuses"),
         Surroundings(pdci=STATUS),
-        "the line is out of service, does not accept the command, or its status is not known; the line's schedule leaves no room",
+        "the line is out of service, does not accept the command, or its status is not known; "
+        "the line's schedule leaves no room",
     ),
 }
 
