@@ -30,11 +30,6 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     return simulations(tmp_path_factory.mktemp("paper"))
 
 
-def own_mw(session: Session, instance: int = 0) -> list[float]:
-    """What one instance alone would have commanded, tick by tick."""
-    return [record.instances[instance].command_mw for record in session.records]
-
-
 # --- Figs. 10, 11: two frames in one window, none in the next -----------------------------------------------------
 
 PERFECT = Plan(control=False, duration_s=10)
@@ -56,7 +51,7 @@ def test_two_then_zero_changes_not_one_bit_of_any_frequency(simulated: Simulated
 def test_two_then_zero_only_holds(simulated: Simulated) -> None:
     """Every command is one that perfect arrival gives too, at most two ticks earlier."""
     session = simulated(TWO_ZERO)
-    perfect, uneven = own_mw(simulated(PERFECT)), own_mw(session)
+    perfect, uneven = simulated(PERFECT).own_mw(), session.own_mw()
     assert max(map(abs, perfect)) > 50
     for k in range(20, 600):
         assert uneven[k] in perfect[k - 2 : k + 1], k
@@ -191,11 +186,11 @@ def test_uneven_and_late_arrival_needs_alignment_all_the_more(arrival: str, simu
     perfect = simulated(south_loss(0, align=True, control=False))
     aligned = simulated(south_loss(0, align=True, control=False, faults=faults))
     loose = simulated(south_loss(0, align=False, control=False, faults=faults))
-    expected = set(own_mw(perfect))
-    assert set(own_mw(aligned)[20:]) <= expected, "held and late, and else what perfect arrival gives"
-    wrong = [mw for mw in own_mw(loose)[20:370] if mw not in expected]
+    expected = set(perfect.own_mw())
+    assert set(aligned.own_mw()[20:]) <= expected, "held and late, and else what perfect arrival gives"
+    wrong = [mw for mw in loose.own_mw()[20:370] if mw not in expected]
     assert len(wrong) > 30 and min(wrong) < -30
-    assert min(own_mw(aligned)[20:370]) == 0.0, "the first half swing is the right way throughout"
+    assert min(aligned.own_mw()[20:370]) == 0.0, "the first half swing is the right way throughout"
 
 
 def test_alignment_only_delays_the_loop() -> None:
@@ -222,7 +217,7 @@ def test_two_windows_without_a_frame_are_held(simulated: Simulated) -> None:
     k = session.tick_at(10.071)
     assert session.counts("N1")[k - 1 : k + 4] == [1, 0, 0, 3, 1]
     assert [session.records[j].instances[0].state for j in range(k - 1, k + 3)] == ["READY", "HELD", "HELD", "READY"]
-    own = own_mw(session)
+    own = session.own_mw()
     assert own[k - 1] == own[k] == own[k + 1] != own[k + 2]
     assert session.when("arrival_gap", "N1") == [] and len(session.when("selected", "N1-S1")) == 1
     reference = simulated(Plan(gain_mw_per_mhz=12, duration_s=11))
@@ -257,7 +252,7 @@ def test_a_stopped_stream_is_left_without_a_step(simulated: Simulated) -> None:
     assert session.when("selected", "N2-S1") == [gap_s]
     assert session.largest_step() <= SLEW_STEP_MW
     k = session.tick_at(gap_s)
-    command, own = session.outcome.command_mw, own_mw(session, 4)
+    command, own = session.outcome.command_mw, session.own_mw(4)
     assert abs(own[k] - command[k - 1]) > 0.01, "what a plain switch would have jumped by"
     assert command[k] == pytest.approx(command[k - 1], abs=1e-9)
     assert command[k + 61] == pytest.approx(own[k + 61], abs=1e-9), "a second later the new one is followed alone"
