@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from support.emulator import Gateway
+from support.feeding import player, recording, spawn
 from support.iio import volts
 from support.live import free_ports
 from support.swing import MS, Streams
@@ -26,7 +27,6 @@ from dcon.limiter import MW_PER_V
 from dcon.link import paths
 from dcon.link.keys import add_key, read_keys
 from dcon.server.client import Client, order
-from pmutools.c37118.config import encode_config
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.timebase import NS
@@ -34,8 +34,11 @@ from pmutools.timebase import NS
 ROOT = Path(__file__).parents[2]
 NAMES = ("N1", "S1")
 PATIENCE_S = 30.0
-LENGTH_S = 20
-"""Of the recording that is played over and over: a whole number of swings."""
+PATIENT = """gps_holdover_s = 0.5
+gap_ms = 500
+latency_max_ms = 500
+"""
+"""Limits of ``[supervisor]`` for a machine that stands still now and then."""
 WAY = {
     "FAULT": ("release", "reset"),
     "ESTOP": ("release", "reset"),
@@ -52,18 +55,6 @@ PROCESSES = {
     "aides": "dcon.aides",
 }
 """What is on the command line of each."""
-
-
-def recording(path: Path, names: tuple[str, ...] = NAMES) -> Path:
-    """Some PMUs in a steady swing, as raw bytes; played in a loop, its end fits its beginning."""
-    streams = Streams(names)
-    with path.open("wb") as file:
-        for name in names:
-            file.write(encode_config(streams.configs[name]))
-        for slot in range(LENGTH_S * 60):
-            for name in names:
-                file.write(streams.data(name, streams.stamp_ns(slot)))
-    return path
 
 
 class Around(threading.Thread):
@@ -98,11 +89,19 @@ class Running:
     """One ``dcon run`` with all that is around it."""
 
     def __init__(
-        self, folder: Path, extra: str = "", names: tuple[str, ...] = NAMES, device: Path | None = None
+        self,
+        folder: Path,
+        extra: str = "",
+        names: tuple[str, ...] = NAMES,
+        device: Path | None = None,
+        *,
+        supervisor: str = PATIENT,
+        **law: Any,
     ) -> None:
         """``extra`` goes to the end of the initialisation file, ``names`` are PMUs of the fleet.
 
-        ``device`` is a fake of an IIO device that is driven, instead of the gateway.
+        ``device`` is a fake of an IIO device that is driven, instead of the gateway. ``supervisor`` are lines of that
+        section, ``law`` keywords of :func:`~dcon.sim.plan.ini_of`.
         """
         self.folder = folder
         self.names = names
@@ -123,9 +122,9 @@ url = {f"iio://{device}?readback=0&settle_ms=0.2" if device else f"udp://127.0.0
 time_source = none
 gps_required = yes
 [supervisor]
-gps_holdover_s = 0.5
-gap_ms = 500
-latency_max_ms = 500
+{supervisor}[pdci]
+required = yes
+url = udp://127.0.0.1:{line_port}
 [watchdog]
 required = yes
 log = {self.watchdog_log}
@@ -136,7 +135,7 @@ keys = {self.keys}
 [log]
 path = {self.log}
 {extra}"""
-        self.ini.write_text(Streams(names).ini(urls=urls, pdci=f"url = udp://127.0.0.1:{line_port}", extra=settings))
+        self.ini.write_text(Streams(names).ini(urls=urls, extra=settings, **law))
         self.around = Around(self.run_dir, line_port, self.driven_mw)
         self._processes: list[subprocess.Popen[bytes]] = []
         self.run: subprocess.Popen[bytes] | None = None
@@ -157,28 +156,28 @@ path = {self.log}
 
     # --- starting and ending
 
-    def start(self, *arguments: str) -> None:
-        played = recording(self.folder / "swing.c37118", self.names)
-        to = [
-            word
+    @property
+    def to(self) -> list[str]:
+        """Where the PMUs are awaited, as a player is told it."""
+        configs = Streams(self.names).configs
+        return [
+            f"udp://127.0.0.1:{port}?idcode={configs[name].idcode}"
             for name, port in zip(self.names, self.ports, strict=True)
-            for word in ("--to", f"udp://127.0.0.1:{port}?idcode={Streams((name,)).configs[name].idcode}")
         ]
-        delayed = ("--delay", "normal(60,1)")
-        player = self._start(
-            *("pmutools.cli", "play", str(played), *to, *delayed, "--loop", "0", "--cfg-period", "1", "--quiet")
-        )
-        with suppress(OSError):  # where it is permitted: a PMU has no other work
-            os.sched_setscheduler(player.pid, os.SCHED_FIFO, os.sched_param(5))
+
+    def start(self, *arguments: str) -> None:
+        """PMUs in a steady swing for ever, and :meth:`begin`."""
+        played = recording(self.folder / "swing.c37118", self.names)
+        self._processes.append(player(self.folder, played, self.to, "--delay", "normal(60,1)", "--loop", "0"))
+        self.begin(*arguments)
+
+    def begin(self, *arguments: str) -> None:
+        """All but the PMUs."""
         self.gateway.start()
         self.around.start()
-        self.run = self._start("dcon.cli", "run", "--ini", str(self.ini), "--run-dir", str(self.run_dir), *arguments)
-
-    def _start(self, module: str, *words: str) -> subprocess.Popen[bytes]:
-        with (self.folder / "stdout").open("ab") as out, (self.folder / "stderr").open("ab") as said:
-            process = subprocess.Popen([sys.executable, "-m", module, *words], stdout=out, stderr=said)
-        self._processes.append(process)
-        return process
+        words = ("run", "--ini", str(self.ini), "--run-dir", str(self.run_dir), *arguments)
+        self.run = spawn(self.folder, "dcon.cli", *words)
+        self._processes.append(self.run)
 
     def end(self) -> int:
         """Ask ``dcon run`` to end; its exit code."""
@@ -273,8 +272,8 @@ path = {self.log}
             time.sleep(0.1)
         raise AssertionError(f"{name}: {answer}; {self.status()['flags']}; {self.said()}")
 
-    def activate(self) -> None:
-        """From wherever it is: ACTIVE in closed loop, with closed relays.
+    def activate(self, least_v: float = 0.5) -> None:
+        """From wherever it is: ACTIVE in closed loop, with closed relays and at least so much driven.
 
         A machine that pauses may trip it on the way: then from there.
         """
@@ -287,7 +286,7 @@ path = {self.log}
             changed_s = time.monotonic() + 1.0
             while self.status()["state"] == state and time.monotonic() < changed_s:
                 time.sleep(0.05)
-        self.until(lambda now: now["state"] == "ACTIVE" and abs(now["output_v"]) > 0.5, "a command")
+        self.until(lambda now: now["state"] == "ACTIVE" and abs(now["output_v"]) >= least_v, "a command")
 
 
 def descendants(pid: int) -> Iterator[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from dcon.settings import Settings, parse
 from dcon.sim.plan import ini_of
@@ -83,19 +84,10 @@ class Streams:
         """What a tick 71 ms after the stamp of ``slot`` is given."""
         return {name: [self.frame(name, slot)] for name in self.streams}
 
-    def ini(
-        self, *, urls: Sequence[str] | None = None, init_s: float = 0.5, pdci: str = "required = no", extra: str = ""
-    ) -> str:
-        return ini_of(
-            self.pmus,
-            gain_mw_per_mhz=9.0,
-            deadband_mhz=0.0,
-            rate_hz=60,
-            urls=urls,
-            init_s=init_s,
-            pdci=pdci,
-            extra=extra,
-        )
+    def ini(self, *, urls: Sequence[str] | None = None, init_s: float = 0.5, extra: str = "", **law: Any) -> str:
+        """``law``: other keywords of :func:`~dcon.sim.plan.ini_of`."""
+        law = {"gain_mw_per_mhz": 9.0, "deadband_mhz": 0.0, "rate_hz": 60} | law
+        return ini_of(self.pmus, urls=urls, init_s=init_s, extra=extra, **law)
 
     def settings(self, **given: object) -> Settings:
         return parse(self.ini(**given), "test.ini")  # type: ignore[arg-type]
