@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs bench soak clean
+.PHONY: demo test lint docs trials bench soak clean
 
 demo: $(VENV)/.demo
 	$(BIN)/dcon demo --out demo
@@ -25,6 +25,10 @@ lint: $(VENV)/.dev
 
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# What becomes of a running controller when, as the tests see it now: the tables of the documentation. Two minutes.
+trials: $(VENV)/.dev
+	DCON_TRIALS=write $(BIN)/python -m pytest tests/platform/test_trials.py tests/platform/test_paper_live.py
 
 bench: $(VENV)/.dev
 	$(BIN)/python tests/bench/run.py
