@@ -122,10 +122,7 @@ url = {f"iio://{device}?readback=0&settle_ms=0.2" if device else f"udp://127.0.0
 time_source = none
 gps_required = yes
 [supervisor]
-{supervisor}[pdci]
-required = yes
-url = udp://127.0.0.1:{line_port}
-[watchdog]
+{supervisor}[watchdog]
 required = yes
 log = {self.watchdog_log}
 [server]
@@ -135,7 +132,8 @@ keys = {self.keys}
 [log]
 path = {self.log}
 {extra}"""
-        self.ini.write_text(Streams(names).ini(urls=urls, extra=settings, **law))
+        line = f"url = udp://127.0.0.1:{line_port}"
+        self.ini.write_text(Streams(names).ini(urls=urls, pdci=line, extra=settings, **law))
         self.around = Around(self.run_dir, line_port, self.driven_mw)
         self._processes: list[subprocess.Popen[bytes]] = []
         self.run: subprocess.Popen[bytes] | None = None
