@@ -8,10 +8,10 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.demo
 	$(BIN)/dcon demo --out demo
 
-# Most tests wait for sockets and clocks, so two run at a time, and what fails beside another is judged again by itself;
+# Most tests wait for sockets and clocks, so three run at a time, and what fails beside another is judged again by itself;
 # then, one at a time and once, those that need the machine to themselves. Both parts run, whatever becomes of the first.
 test: lint docs
-	$(BIN)/python -m pytest -n 2 --dist loadscope --durations 40 --durations-min 5 -m "not alone"; beside=$$?; \
+	$(BIN)/python -m pytest -n 3 --dist loadscope --durations 40 --durations-min 5 -m "not alone"; beside=$$?; \
 	if [ $$beside = 1 ]; then \
 	  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not alone"; beside=$$?; \
 	fi; \
