@@ -8,25 +8,20 @@ armed again but by an operator.
 from __future__ import annotations
 
 import logging
-import math
 import os
 import select
 import signal
-import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import NamedTuple
 
-from dcon.household.backoff import Backoff
-from dcon.household.ear import Ear, ear_of
+from dcon.household.ear import ear_of
+from dcon.household.member import ENDED, PLATFORM, STARTED, Lives
 from dcon.household.places import await_places
-from dcon.link import paths
-from dcon.link.children import HUNG_S, ending, launch
+from dcon.link.children import HUNG_S, ending
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from pmutools.errors import SourceError
 
@@ -56,28 +51,6 @@ class NotStarted(SourceError):
         return self.code in (FAILED, USAGE)
 
 
-class Member(NamedTuple):
-    """One process, and how long it may take to end."""
-
-    name: str
-    inbox: str
-    """Its socket in the run folder."""
-    kind: int = socket.SOCK_DGRAM
-    patience_s: float = 5.0
-
-
-WATCHDOG = Member("watchdog", paths.WATCHDOG)
-SERVER = Member("server", paths.SERVER, socket.SOCK_SEQPACKET, 15.0)
-OUTPUT = Member("output", paths.OUTPUT)
-PLATFORM = Member("platform", paths.CONTROL, patience_s=10.0)
-SPEAKERS = (SERVER, PLATFORM)
-"""Their standard output is kept: what they say of the run at its end."""
-STARTED = (WATCHDOG, SERVER, OUTPUT, PLATFORM)
-"""In this order; who is not needed is left out."""
-ENDED = (PLATFORM, SERVER, WATCHDOG, OUTPUT)
-"""In this order: the command ramps down, the log is closed, and only then do the relays open."""
-
-
 @dataclass
 class Outcome:
     """How a run went."""
@@ -87,20 +60,6 @@ class Outcome:
     restarts: dict[str, int] = field(default_factory=dict)
     said: dict[str, list[str]] = field(default_factory=dict)
     """What each controller and each server wrote to its standard output, by name; one that was killed wrote nothing."""
-
-
-@dataclass
-class _Running:
-    member: Member
-    ear: Ear
-    process: subprocess.Popen[str] | None = None
-    pidfd: int = -1
-    started_s: float = 0.0
-    again_s: float = math.inf
-    """When to start it again, where it does not run."""
-    was_ready: bool = False
-    """In this life or one before."""
-    backoff: Backoff = field(default_factory=Backoff)
 
 
 class Household:
@@ -133,7 +92,7 @@ class Household:
         self._is_over = is_over
         self._commands = commands
         self._notifier = notifier or Notifier({})
-        self._running: dict[str, _Running] = {}
+        self._running: dict[str, Lives] = {}
         self._poll = select.poll()
         self._round_s = time.monotonic()
         self._wake, self._woken = os.pipe()
@@ -163,9 +122,8 @@ class Household:
             for member in needed:
                 if self.stopping or self._over:
                     break
-                each = self._running[member.name] = _Running(member, Ear(self.folder, member.name))
-                each.ear.register(self._poll)
-                self._start(each)
+                each = self._running[member.name] = Lives(member, self.folder, self._poll)
+                each.start(self._commands[member.name]())
                 while not (each.was_ready or self.stopping or self._over):
                     self._round()
             self._starting = False
@@ -193,33 +151,6 @@ class Household:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    # --- starting
-
-    def _start(self, each: _Running) -> None:
-        """Raises SourceError where the system has no room for one more."""
-        out = subprocess.PIPE if each.member in SPEAKERS else subprocess.DEVNULL
-        environment = {**os.environ, "NOTIFY_SOCKET": each.ear.path}
-        command = self._commands[each.member.name]()
-        each.ear.begin()
-        each.started_s = time.monotonic()
-        try:
-            each.process = launch(command, dies_by=signal.SIGTERM, stdout=out, env=environment)
-            each.pidfd = os.pidfd_open(each.process.pid)
-        except (OSError, subprocess.SubprocessError) as error:
-            self._abandon(each)
-            reason = getattr(error, "strerror", None) or error
-            raise SourceError(f"the {each.member.name} process could not be started, {reason}") from None
-        self._poll.register(each.pidfd, select.POLLIN)
-
-    def _abandon(self, each: _Running) -> None:
-        """End one that nobody could look after."""
-        process, each.process = each.process, None
-        if process is not None:
-            process.kill()
-            process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
-
     # --- looking after
 
     def _round(self) -> None:
@@ -232,9 +163,7 @@ class Household:
         last_s, self._round_s = self._round_s, time.monotonic()
         passed_s = min(self._round_s - last_s, ROUND_S)  # where the whole machine stood still, nobody has hung
         for each in self._running.values():
-            has_ended = each.process is not None and each.process.poll() is not None
-            each.ear.listen(passed_s)  # its last words too
-            each.was_ready = each.was_ready or each.ear.is_ready
+            has_ended = each.listen(passed_s)
             if each.process is not None:
                 if has_ended:
                     self._bury(each)
@@ -242,7 +171,7 @@ class Household:
                     self._judge(each)
             elif time.monotonic() >= each.again_s and not self.stopping:
                 try:
-                    self._start(each)
+                    each.start(self._commands[each.member.name]())
                 except SourceError as error:
                     self._put_off(each, str(error))
         if self._starting:
@@ -250,8 +179,8 @@ class Household:
         missing = [name for name, each in self._running.items() if each.process is None]
         self._notifier.tell(ALIVE, status=f"waiting to restart {', '.join(missing)}" if missing else "running")
 
-    def _judge(self, each: _Running) -> None:
-        """Kill one that hangs; it is buried when it is dead, and nobody waits for that: a disk may hold it."""
+    def _judge(self, each: Lives) -> None:
+        """Kill one that hangs."""
         ear, name = each.ear, each.member.name
         limit_s = HUNG_S if ear.is_ready else START_S
         if ear.silent_s <= limit_s:
@@ -259,11 +188,9 @@ class Household:
         if not each.was_ready:
             raise SourceError(f"the {name} process is not ready after {START_S:g} s")
         LOG.error("the %s process has not beaten for %g s, and is killed", name, limit_s)
-        assert each.process is not None
-        each.process.kill()
-        ear.silent_s = 0.0
+        each.kill()
 
-    def _bury(self, each: _Running) -> None:
+    def _bury(self, each: Lives) -> None:
         """It has ended: is that the end of the run, or when is it to be started again?
 
         Raises SourceError where it never was ready: it would be the same again.
@@ -277,26 +204,17 @@ class Household:
         else:
             self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
 
-    def _put_off(self, each: _Running, why: str) -> None:
-        """It does not run: start it again, the later the more often that has happened."""
-        now_s, name = time.monotonic(), each.member.name
-        each.backoff, wait_s = each.backoff.ended(now_s - each.started_s)
-        each.again_s = now_s + wait_s
+    def _put_off(self, each: Lives, why: str) -> None:
+        name = each.member.name
         self.outcome.restarts[name] = self.outcome.restarts.get(name, 0) + 1
-        LOG.warning("%s; started again in %g s", why, wait_s)
+        LOG.warning("%s; started again in %g s", why, each.put_off())
 
-    def _close(self, each: _Running) -> int:
-        process = each.process
-        assert process is not None
-        code = process.wait()
-        if process.stdout is not None:
+    def _close(self, each: Lives) -> int:
+        code, text = each.bury()
+        if text is not None:
             said = self.outcome.said.setdefault(each.member.name, [])
-            said.append(process.stdout.read())
+            said.append(text)
             del said[:-MOST_SAID]
-            process.stdout.close()
-        self._poll.unregister(each.pidfd)
-        os.close(each.pidfd)
-        each.process = None
         if each.member is PLATFORM:
             self.outcome.code = code
         return code
@@ -309,7 +227,9 @@ class Household:
             for member in ENDED:
                 each = self._running.get(member.name)
                 if each is not None and each.process is not None:
-                    self._ask_to_end(each)
+                    self._notifier.tell(ALIVE)
+                    each.ask_to_end()
+                    self._close(each)
         finally:
             for each in self._running.values():
                 if each.process is not None:
@@ -318,14 +238,3 @@ class Household:
                 each.ear.close()
             os.close(self._wake)
             os.close(self._woken)
-
-    def _ask_to_end(self, each: _Running) -> None:
-        assert each.process is not None
-        self._notifier.tell(ALIVE)
-        each.process.terminate()
-        try:
-            each.process.wait(each.member.patience_s)
-        except subprocess.TimeoutExpired:
-            LOG.error("the %s process does not end, and is killed", each.member.name)
-            each.process.kill()
-        self._close(each)

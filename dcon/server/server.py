@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import selectors
-import socket
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
-from dcon.link.assembly import Assembly, Pieces, Place
 from dcon.link.beats import LoopName, LoopState, encode_beat
-from dcon.link.bundle import LARGEST, Bundle, Kind, decode
+from dcon.link.bundle import Bundle
 from dcon.link.keys import read_keys
+from dcon.link.news import ServerWord, encode
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
 from dcon.server.around import LineSource
 from dcon.server.desk import Desk
+from dcon.server.intake import Intake
 from dcon.server.newest import Newest, to_json
 from dcon.server.operators import Operators
 from dcon.server.recorder import Recorder, Report
 from dcon.server.response import LineResponse, Response
 from dcon.server.scribe import Scribe
 from dcon.server.told import WatchdogWord
-from dcon.session.head import Head, head_of
+from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.clock import Clock, SystemClock
 from pmutools.timebase import NS
@@ -41,11 +40,7 @@ SILENT_S = 2.0
 """A disk that holds the log up for longer makes the server silent to the controller: nothing is recorded."""
 FRESH_NS = NS // 2
 """A controller whose newest tick is older is not connected, whatever its socket says."""
-CONNECTIONS = 8
-"""Of controllers, at once: one is enough, but a new one may come before an old one is known to be gone."""
-BUNDLES_A_ROUND = 64
-"""Read from one connection before others have their turn."""
-READ_BYTES = LARGEST + 1
+DATAGRAM_BYTES = 1 << 17
 
 
 class Server:
@@ -77,12 +72,13 @@ class Server:
         self.response = LineResponse()
         self.report = Report()
         self.failures = 0
-        self.malformed = 0
-        """Messages on the controller's socket that are no bundles, and heads that say nothing."""
         self._selector = selectors.DefaultSelector()
-        self._listener = paths.listen(self.folder, paths.SERVER)
+        self._reports: deque[Report] = deque(maxlen=1)
+        log = settings.log
+        recorder = Recorder(log.path, self.folder, max_mb=log.max_mb, max_minutes=log.max_minutes)
+        self._scribe = Scribe(recorder, self._reports.append)
+        self._intake = Intake(self.folder, self._selector, self._scribe, recorder.resumes, self._opened, self._look)
         self._replies = paths.bind_datagram(self.folder, paths.REPLIES)
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         patience_ns = round(settings.watchdog.status_timeout_ms * 1e6)
         self._word = WatchdogWord(paths.bind_datagram(self.folder, paths.STATUS), patience_ns)
         self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
@@ -92,21 +88,12 @@ class Server:
         self.desk = Desk(self.folder, self.status, verifier)
         self.desk.reply_to = str(self.folder / paths.REPLIES)
         self.operators = Operators(settings.server.listen, self.desk, self._selector)
-        self._connections: list[socket.socket] = []
-        self._source: socket.socket | None = None
-        """The connection whose session is being recorded."""
         self._lag_ns: int | None = None
         """Of the newest tick when it came."""
         self._looked_ns = 0
         """When that was, monotonic."""
         self._found: Response | None = None
         self._beats = 0
-        self._reports: deque[Report] = deque(maxlen=1)
-        self._acked: tuple[int | None, int] = (None, -1)
-        log = settings.log
-        recorder = Recorder(log.path, self.folder, max_mb=log.max_mb, max_minutes=log.max_minutes)
-        self._assembly = Assembly(recorder.resumes)
-        self._scribe = Scribe(recorder, self._reports.append)
 
     def run(self) -> None:
         """Serve until :attr:`stopping`; then write what has come, and end the log."""
@@ -144,7 +131,7 @@ class Server:
         now_ns, monotonic_ns = self.clock.realtime_ns(), self.clock.monotonic_ns()
         self._word.hear(monotonic_ns)
         report, age_ns = self.report, self._tick_age_ns(monotonic_ns)
-        connected = self._source is not None and age_ns is not None and age_ns < FRESH_NS
+        connected = self._intake.is_connected and age_ns is not None and age_ns < FRESH_NS
         controller = self.newest.status(now_ns, not connected)
         word = self._word.told(monotonic_ns, now_ns)
         return {
@@ -171,7 +158,7 @@ class Server:
                 "turned_away": self.operators.turned_away,
                 "orders_relayed": self.desk.relayed,
                 "orders_pending": len(self.desk.pending),
-                "malformed": self.malformed + self._assembly.malformed + self._word.malformed,
+                "malformed": self._intake.malformed + self._word.malformed,
                 "failures": self.failures,
                 "undecodable": self.newest.undecodable,
             },
@@ -185,88 +172,14 @@ class Server:
         self._acknowledge()
         self.operators.close()
         self.desk.close()
-        for sock in self._connections:
-            sock.close()
+        self._intake.close()
         self._watchdog.close()
         self._control.close()
         self._selector.close()
-        paths.release(self._listener)
         paths.release(self._replies)
         paths.release(self._word.sock)
 
-    def _accept(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
-        try:
-            sock, _ = self._listener.accept()
-        except OSError:
-            return
-        sock.setblocking(False)
-        if len(self._connections) >= CONNECTIONS:
-            self._end(next(each for each in self._connections if each is not self._source))
-        self._connections.append(sock)
-
-        def ready(_events: int, _now_ns: int, utc_ns: int) -> None:
-            self._receive(sock, utc_ns)
-
-        self._selector.register(sock, selectors.EVENT_READ, ready)
-        place = self._assembly.place
-        self._say(sock, {"session": place.session, "have": place.have})
-
-    def _end(self, sock: socket.socket) -> None:
-        if sock in self._connections:
-            self._connections.remove(sock)
-            self._selector.unregister(sock)
-            sock.close()
-        if sock is self._source:
-            self._source = None
-
-    def _say(self, sock: socket.socket, said: dict[str, Any]) -> None:
-        try:
-            sock.send(json.dumps(said).encode())
-        except BlockingIOError:  # it does not read: the next word says it all again
-            pass
-        except OSError:
-            self._end(sock)
-
-    def _receive(self, sock: socket.socket, utc_ns: int) -> None:
-        for _ in range(BUNDLES_A_ROUND):
-            if not self._scribe.has_room or sock not in self._connections:
-                return
-            try:
-                data = sock.recv(READ_BYTES)
-            except BlockingIOError:
-                return
-            except OSError:
-                data = b""
-            if not data:
-                self._end(sock)
-                return
-            bundle = decode(data)
-            if bundle is None:
-                self.malformed += 1
-                self._end(sock)
-                return
-            self._take(sock, bundle, len(data), utc_ns)
-
-    def _take(self, sock: socket.socket, bundle: Bundle, size: int, utc_ns: int) -> None:
-        if not self._assembly.wants(bundle):
-            return
-        self._scribe.put(bundle, size)
-        for item in self._assembly.take(bundle):
-            if isinstance(item, Pieces):
-                self._open(sock, item)
-            elif isinstance(item, Bundle) and item.kind is Kind.TICK:
-                self._look(item, utc_ns)
-
-    def _open(self, sock: socket.socket, pieces: Pieces) -> None:
-        """What the session is: of a session that is known too, for a server that was started again."""
-        head = head_of(pieces.bundles)
-        if head is None:
-            self.malformed += 1
-            return
-        self._source = sock
-        is_new = pieces.session != self._assembly.place.session
-        if is_new:
-            self._assembly.begin(Place(pieces.session))
+    def _opened(self, head: Head, is_new: bool) -> None:
         if is_new or head != self.newest.head:
             self.newest = Newest(head, self._line)
             self._lag_ns = None
@@ -287,7 +200,7 @@ class Server:
 
     def _reply(self, _events: int, _now_ns: int, _utc_ns: int) -> None:
         try:
-            datagram = self._replies.recv(READ_BYTES)
+            datagram = self._replies.recv(DATAGRAM_BYTES)
         except OSError:
             return
         self.operators.answer(self.desk.reply(datagram))
@@ -299,10 +212,7 @@ class Server:
         report = self.report
         if report.paths[:1] != before.paths[:1] and report.file:
             self._begun(report.file)
-        safe = (report.session, report.have)
-        if safe != self._acked and report.session == self._assembly.place.session and self._source is not None:
-            self._acked = safe
-            self._say(self._source, {"ack": report.have})
+        self._intake.acknowledge(report)
 
     def _hangs(self) -> bool:
         return self._scribe.hangs(SILENT_S)
@@ -316,13 +226,8 @@ class Server:
         self._found = found = self.response.estimate()
         hangs = self._hangs()
         if not hangs:
-            news = {
-                "kind": "server",
-                "disk_free_percent": self.report.disk_free_percent,
-                "response_gain": None if found is None else found.gain,
-                "response_lag_ms": None if found is None else found.lag_ms,
-            }
-            self._control.send(json.dumps(news).encode())
+            gain, lag_ms = (None, None) if found is None else (found.gain, found.lag_ms)
+            self._control.send(encode(ServerWord(self.report.disk_free_percent, gain, lag_ms)))
         trouble = "; the log hangs" if hangs else ""  # a new process would hang too, and serve nobody meanwhile
         self._notifier.tell(ALIVE, status=f"{self.newest.ticks} ticks, {self.report.unlogged} missing{trouble}")
         self.operators.watched(to_json(self.status()) if self.operators.is_watched else b"", now_ns)

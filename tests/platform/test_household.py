@@ -17,8 +17,9 @@ from typing import Any
 
 import pytest
 
-from dcon.household import household, places
-from dcon.household.household import ENDED, STARTED, Household, NotStarted
+from dcon.household import household, member, places
+from dcon.household.household import Household, NotStarted
+from dcon.household.member import ENDED, STARTED
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, bind_datagram, prepare
 from pmutools.errors import SourceError
@@ -162,7 +163,7 @@ def test_a_system_without_room_for_a_process_is_asked_again_later(
     house = House(tmp_path)
     house.lives["server"] = [(0.2, 1), (60, 0)]
     refused: list[int] = []
-    where, name = {"fork": (household, "launch"), "pidfd": (os, "pidfd_open")}[call]
+    where, name = {"fork": (member, "launch"), "pidfd": (os, "pidfd_open")}[call]
     right = getattr(where, name)
 
     def scarce(*given: Any, **named: Any) -> Any:

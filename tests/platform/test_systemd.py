@@ -12,7 +12,7 @@ import pytest
 
 from dcon.cli import COMMANDS, dcon
 from dcon.cli.run import command as run_command
-from dcon.household.household import ENDED, STARTED
+from dcon.household.member import ENDED, STARTED
 from dcon.settings import load
 from pmutools.cli.shell import run
 
