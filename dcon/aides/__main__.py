@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import signal
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from dcon.aides.crew import aides, work
 from dcon.link import paths
 from dcon.link.crossing import Failure
+from dcon.link.news import encode
 from dcon.settings import load
 from pmutools import linux
 from pmutools.errors import PmuError
@@ -38,7 +38,7 @@ def main(arguments: list[str]) -> int:
         failure = Failure.of(error)
     if failure is None:
         return 0
-    told = json.dumps({"kind": "failed", **failure._asdict()}).encode()
+    told = encode(failure)
     if not paths.Sender(given.run_dir / paths.CONTROL).send(told):  # else who has started this one says it
         sys.stderr.write(f"aides: {failure.reason}\n")
     return 1

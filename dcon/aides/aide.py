@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 from dcon.link import paths
 from dcon.link.beats import LoopName, LoopState
+from dcon.link.news import LoopCounts, News, encode
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
 from pmutools.timebase import NS
@@ -27,6 +26,7 @@ class Aide(threading.Thread):
 
     def __init__(self, loop: LoopName, run_dir: Path) -> None:
         super().__init__(name=loop, daemon=True)
+        self.loop = loop
         self._watchdog, self._control = Sender(run_dir / paths.WATCHDOG), Sender(run_dir / paths.CONTROL)
         self._pulse = Pulse(loop, self._watchdog)
         self._stopped = threading.Event()
@@ -64,9 +64,9 @@ class Aide(threading.Thread):
         self._watchdog.close()
         self._control.close()
 
-    def tell(self, news: dict[str, Any]) -> bool:
+    def tell(self, news: News) -> bool:
         """To the control process; whether it was taken."""
-        taken = self._control.send(json.dumps(news, allow_nan=False).encode())
+        taken = self._control.send(encode(news))
         self._untold += not taken
         return taken
 
@@ -79,5 +79,5 @@ class Aide(threading.Thread):
             return
         self._counted_ns = now_ns
         counts = {name: value for name, value in self.counts().items() if value}
-        if counts != self._counted and self.tell({"kind": "counts", "loop": self.name, "counts": counts}):
+        if counts != self._counted and self.tell(LoopCounts(self.loop, counts)):
             self._counted = counts

@@ -10,6 +10,7 @@ from pathlib import Path
 from dcon.aides.aide import ROUND_S, Aide
 from dcon.aides.gps_lock import Lock, Verdict, judge
 from dcon.link.beats import LoopName
+from dcon.link.news import GpsLock
 from dcon.sections import Platform
 from pmutools.clocksources.asking import Patience
 from pmutools.clocksources.watch import HERE, ClockSources, Places
@@ -72,4 +73,4 @@ class GpsAide(Aide):
             level = logging.INFO if verdict.locked else logging.WARNING
             LOG.log(level, "GPS lock of the clock: %s, by %s: %s", "yes" if verdict.locked else "no", *verdict[1:])
         self._told, self._told_ns = state, now_ns
-        self.tell({"kind": "gps", "age_s": age_s, "source": verdict.source, "detail": verdict.detail})
+        self.tell(GpsLock(age_s, verdict.source, verdict.detail))

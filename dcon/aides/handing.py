@@ -6,13 +6,13 @@ stop goes first, and what waited before it is given up: nothing that was ordered
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from dcon.aides.order_gate import Passed
 from dcon.core.system import Trigger
+from dcon.link.news import encode
 from pmutools.timebase import NS
 
 PATIENCE_NS: Final = NS
@@ -52,8 +52,8 @@ class Handing:
         """Take what has passed the gate at ``now_ns``, of a clock without steps."""
         if passed.news is None:
             return
-        made = _Waiting(now_ns + PATIENCE_NS, json.dumps(passed.news, allow_nan=False).encode(), passed)
-        if passed.news["name"] == Trigger.ESTOP:
+        made = _Waiting(now_ns + PATIENCE_NS, encode(passed.news), passed)
+        if passed.news.name == Trigger.ESTOP:
             orders = [each for each in self._waiting if each.passed.order]
             self._waiting = deque([made, *(each for each in self._waiting if not each.passed.order)])
             for each in orders:

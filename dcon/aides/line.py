@@ -49,10 +49,7 @@ class PdciAide(Aide):
 
     def _tell(self, line: Pdci) -> None:
         self._told = line
-        said = line._asdict()
-        if line.scheduled_mw != line.scheduled_mw:  # NaN, which JSON has not
-            said["scheduled_mw"] = None
-        self.tell({"kind": "pdci", **said})
+        self.tell(line)
 
     def counts(self) -> dict[str, int]:
         return super().counts() | {

@@ -24,7 +24,7 @@ LOG = logging.getLogger(__name__)
 class Passed(NamedTuple):
     """What became of one datagram."""
 
-    news: dict[str, Any] | None = None
+    news: Order | None = None
     """For the control process."""
     reply: dict[str, Any] | None = None
     """For who handed it on: ``{"digest", "refused"}``. What was accepted shows in the log of the session."""
@@ -66,14 +66,9 @@ class OrderGate:
         if isinstance(found, Refused):
             self.refused += 1
             told = self._refusals.order(found, signed, now_ns)
-            news = None if told is None else _order(told)
-            return Passed(news, {"digest": digest(signed), "refused": found.reason}, reply_to)
+            return Passed(told, {"digest": digest(signed), "refused": found.reason}, reply_to)
         if not save_sequences(self._folder, self.verifier.last):
             LOG.warning("%s: cannot be written", self._folder / SEQUENCES)
             with suppress(OSError):  # better none than one that is behind
                 (self._folder / SEQUENCES).unlink()
-        return Passed(_order(found.order), None, reply_to, digest(signed))
-
-
-def _order(order: Order) -> dict[str, Any]:
-    return {"kind": "order", **order._asdict()}
+        return Passed(found.order, None, reply_to, digest(signed))

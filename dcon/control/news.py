@@ -5,16 +5,16 @@ News come as datagrams to ``control.in``. The newest of each kind counts, and fo
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Final, NamedTuple
 
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import LoopName, Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
-from dcon.link.counts import COUNTS, total
+from dcon.link.counts import total
 from dcon.link.crossing import Failure
+from dcon.link.news import GpsLock, LoopCounts, ServerWord, decode
 from dcon.session.codec import Watchdog
 
 GPS_NS = 3_000_000_000
@@ -31,15 +31,7 @@ BEATING_MS = 250.0
 """Those of an earlier life are older: a process is started again after so long, and takes its time."""
 SERVER_NS = 3_000_000_000
 """What the server has found out is not told any longer once it has been silent for so long."""
-
-
-class Server(NamedTuple):
-    """What the server says, heard at ``heard_ns``."""
-
-    heard_ns: int
-    disk_free_percent: float | None = None
-    response_gain: float | None = None
-    response_lag_ms: float | None = None
+NOTHING_FOUND: Final = ServerWord()
 
 
 class Heard(NamedTuple):
@@ -55,7 +47,9 @@ class Heard(NamedTuple):
     """Stamped by its sender's CLOCK_MONOTONIC, which is this process's too; so is ``readback``."""
     readback: Readback | None = None
     pdci: Pdci | None = None
-    server: Server | None = None
+    server: ServerWord = NOTHING_FOUND
+    server_ns: int | None = None
+    """None before the server has said anything."""
     ignored: int = 0
     """Datagrams that say nothing which is known here."""
     failed: Failure | None = None
@@ -78,85 +72,25 @@ def hear(heard: Heard, datagram: bytes, now_ns: int) -> Said:
         return Said(heard._replace(status=status))
     if (readback := decode_readback(datagram)) is not None and math.isfinite(readback.volts):
         return Said(heard._replace(readback=readback))
-    try:
-        said = json.loads(datagram)
-        return _KINDS[said["kind"]](heard, said, now_ns)
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        return Said(heard._replace(ignored=heard.ignored + 1))
-
-
-def _gps(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
-    age_s = _number(said["age_s"])
-    if age_s < 0:
-        raise ValueError("a lock from the future")
-    return Said(heard._replace(gps_age_s=age_s, gps_ns=now_ns))
-
-
-def _pdci(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
-    scheduled_mw = said.get("scheduled_mw")
-    pdci = Pdci(
-        _time_ns(said["time_ns"]),
-        _number(said["power_mw"]),
-        said["in_service"] is True,
-        said["dcon_enabled"] is True,
-        math.nan if scheduled_mw is None else _number(scheduled_mw),
-    )
-    return Said(heard._replace(pdci=pdci))
-
-
-def _order(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
-    name, text, who, why = (said.get(key, "") for key in ("name", "text", "who", "why"))
-    name, text, who, why = map(_words, (name, text, who, why))
-    return Said(heard, Order(name, _number(said.get("value") or 0.0), text, who, why))
-
-
-def _server(heard: Heard, said: Mapping[str, Any], now_ns: int) -> Said:
-    found = [said.get(key) for key in Server._fields[1:]]
-    return Said(heard._replace(server=Server(now_ns, *(None if value is None else _number(value) for value in found))))
-
-
-def _counts(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
-    loop = LoopName(said["loop"])
-    counts = {name: _count(value) for name, value in said["counts"].items() if name in COUNTS}
-    return Said(heard._replace(counts={**heard.counts, loop: counts}))
-
-
-def _failed(heard: Heard, said: Mapping[str, Any], _now_ns: int) -> Said:
-    return Said(heard._replace(failed=Failure(_words(said["reason"]), said["is_mistake"] is True)))
-
-
-_KINDS = {"gps": _gps, "pdci": _pdci, "order": _order, "server": _server, "counts": _counts, "failed": _failed}
-
-
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise TypeError(f"{value!r} is no number")
-    return float(value)
-
-
-def _words(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
-    value.encode()  # JSON has halves of surrogates, which no log takes
-    return value
-
-
-def _count(value: object) -> int:
-    if type(value) is not int or not 0 <= value < 1 << 63:
-        raise ValueError(f"{value!r} is no count")
-    return value
+    match decode(datagram):
+        case Order() as order:
+            return Said(heard, order)
+        case GpsLock() as lock:
+            return Said(heard._replace(gps_age_s=lock.age_s, gps_ns=now_ns))
+        case Pdci() as line:
+            return Said(heard._replace(pdci=line))
+        case ServerWord() as word:
+            return Said(heard._replace(server=word, server_ns=now_ns))
+        case LoopCounts(loop, counts):
+            return Said(heard._replace(counts={**heard.counts, loop: counts}))
+        case Failure() as failure:
+            return Said(heard._replace(failed=failure))
+    return Said(heard._replace(ignored=heard.ignored + 1))
 
 
 def counted(heard: Heard) -> dict[str, int]:
     """All that was counted of the news, and by who tells them."""
     return total({"news_ignored": heard.ignored}, *heard.counts.values())
-
-
-def _time_ns(value: object) -> int:
-    """POSIX UTC, as the log can hold it."""
-    if type(value) is not int or not 0 <= value < 1 << 63:
-        raise ValueError(f"{value!r} is no time")
-    return value
 
 
 def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
@@ -165,10 +99,8 @@ def surroundings(heard: Heard, now_ns: int, sent_ns: int) -> Surroundings:
     A readback counts only where it was taken after that: an older one answers an older command.
     """
     readback, status = heard.readback, heard.status
-    server = heard.server or Server(heard.started_ns)
-    silent_ns = max(now_ns - server.heard_ns, 0)
-    if silent_ns > SERVER_NS:
-        server = Server(server.heard_ns)
+    silent_ns = max(now_ns - (heard.started_ns if heard.server_ns is None else heard.server_ns), 0)
+    server = heard.server if silent_ns <= SERVER_NS else NOTHING_FOUND
     return Surroundings(
         gps_age_s=_gps_age_s(heard, now_ns),
         watchdog_healthy=is_healthy(heard, now_ns),

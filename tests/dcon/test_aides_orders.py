@@ -22,6 +22,7 @@ from support.run_folder import in_thread, is_socket, listening, send
 
 from dcon.aides.order_gate import OrderGate, Passed
 from dcon.aides.orders import GuiAide
+from dcon.core.values import Order
 from dcon.link.keys import SEQUENCES, add_key, read_keys
 from dcon.link.orders import SignedOrder, Verifier, digest, sign
 from dcon.link.paths import AIDE, CONTROL, REPLIES, WATCHDOG, Sender, bind_datagram, prepare, release
@@ -65,14 +66,7 @@ def why_not(passed: Passed) -> str:
 def test_an_order_passes_with_all_that_it_says(folder: Path) -> None:
     order = signed(folder, "gain", value=12.0, why="more damping", text="")
     passed = gate(folder).take(datagram(order, "/somewhere"), 0, UTC_NS)
-    assert passed.news == {
-        "kind": "order",
-        "name": "gain",
-        "value": 12.0,
-        "text": "",
-        "who": "ann",
-        "why": "more damping",
-    }
+    assert passed.news == Order("gain", 12.0, "", "ann", "more damping")
     assert passed.reply is None
 
 
@@ -90,11 +84,11 @@ def test_what_is_refused_becomes_an_input_that_says_why(folder: Path) -> None:
         assert (
             passed.reply_to == "/somewhere"
             and passed.news is not None
-            and passed.news["name"] == "link_refused"
-            and passed.news["who"] == who
+            and passed.news.name == "link_refused"
+            and passed.news.who == who
         )
-        assert reason in passed.news["text"] and it.refused == 1
-        assert passed.reply == {"digest": digest(order), "refused": passed.news["text"]}
+        assert reason in passed.news.text and it.refused == 1
+        assert passed.reply == {"digest": digest(order), "refused": passed.news.text}
 
 
 def test_no_more_than_ten_refusals_a_second_are_told_and_the_rest_is_counted(folder: Path) -> None:
@@ -102,7 +96,7 @@ def test_no_more_than_ten_refusals_a_second_are_told_and_the_rest_is_counted(fol
     told = [it.take(datagram(b"x"), k * NS // 1000, UTC_NS).news for k in range(500)]
     assert sum(news is not None for news in told) == 10 and it.refused == 500
     last = it.take(datagram(b"x"), 2 * NS, UTC_NS).news
-    assert last is not None and "and 490 more were refused" in last["text"]
+    assert last is not None and "and 490 more were refused" in last.text
 
 
 def test_what_was_accepted_once_never_is_again_and_a_restart_does_not_forget(folder: Path) -> None:

@@ -182,6 +182,10 @@ def test_rot_loses_whole_ticks_and_marks_the_first_after_them(tmp_path: Path) ->
     assert reader.damage.records == 1 and not reader.damage.cut
 
 
+TIMES = range(9, 25)
+"""Bytes of a chunk that hold the times of its first and last message, which a reader of all of it has no use for."""
+
+
 def test_a_flipped_bit_in_a_log_of_a_killed_process_loses_the_chunk_it_hits_and_no_more(tmp_path: Path) -> None:
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
@@ -204,7 +208,9 @@ def test_a_flipped_bit_in_a_log_of_a_killed_process_loses_the_chunk_it_hits_and_
         hit = [span for (start, end), span in zip(spans, starts, strict=True) if start <= at < end]
         missing = {tick.record.tick_ns for tick in ticks} - seen
         assert all(any(tick_ns in span for span in hit) for tick_ns in missing), at
-        assert not reader.damage.orphans and bool(hit) <= bool(reader.damage.losses)
+        told = any(start <= at < end and at - start not in TIMES for start, end in spans)
+        assert not reader.damage.orphans and told <= bool(reader.damage.losses)
+        assert bool(missing) <= bool(reader.damage.losses)
 
 
 def test_a_damaged_head_does_not_hide_the_session(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 
 from dcon.aides.handing import NOT_TAKEN, PATIENCE_NS, STOPPED, WAITING, Handing, Reply
 from dcon.aides.order_gate import Passed
+from dcon.core.values import Order
 from dcon.link.orders import ANSWER_NS
 
 PATH = "/run/dcon/server.replies"
@@ -27,12 +28,12 @@ class Control:
 
 
 def passed(name: str, order: str = "") -> Passed:
-    return Passed({"kind": "order", "name": name}, None, PATH, order or name)
+    return Passed(Order(name), None, PATH, order or name)
 
 
 def refusal() -> Passed:
     """Of an order that the gate has refused, and has said so."""
-    return Passed({"kind": "order", "name": "link_refused"}, {"digest": "x", "refused": "too old"}, PATH)
+    return Passed(Order("link_refused"), {"digest": "x", "refused": "too old"}, PATH)
 
 
 def given_up(name: str, why: str = NOT_TAKEN) -> Reply:
