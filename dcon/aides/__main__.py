@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dcon.aides.crew import aides, work
 from dcon.link import paths
-from dcon.link.crossing import Failure
+from dcon.link.failure import Failure
 from dcon.link.news import encode
 from dcon.settings import load
 from pmutools import linux

@@ -47,7 +47,6 @@ class Aide(threading.Thread):
             LOG.exception("the %s loop failed", self.name)
             self.failure = f"{type(error).__name__}: {error}"
         finally:
-            self._pulse.due_ns = 0
             self._pulse.beat(time.monotonic_ns(), LoopState.FAILED if self.failure else LoopState.ENDING)
             self.release()
 

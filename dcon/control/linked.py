@@ -23,7 +23,9 @@ from dcon.link.beats import LoopName
 from dcon.link.bundle import Entry
 from dcon.link.children import Children
 from dcon.link.command import CommandOut, encode
-from dcon.link.crossing import Counts, Failure, Item, decode
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import Item, decode
+from dcon.link.failure import Failure
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
 from dcon.link.shipper import Ring, Shipper
@@ -60,7 +62,7 @@ class PairFrames:
     def __init__(self, sock: socket.socket, clock: Clock) -> None:
         sock.setblocking(False)
         self._sock, self._clock = sock, clock
-        self.counts = Counts()
+        self.counts = FrontCounts()
         self._early: list[Item] = []
 
     def wait(self, deadline_ns: int) -> None:
@@ -87,7 +89,7 @@ class PairFrames:
             if not message:  # the front has ended: the kernel says so to its parent too
                 return
             for item in decode(message):
-                if isinstance(item, Counts):
+                if isinstance(item, FrontCounts):
                     self.counts = item
                 else:
                     yield item

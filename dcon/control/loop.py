@@ -28,7 +28,8 @@ from dcon.core.values import Order, SystemState
 from dcon.engine import Engine, Tick
 from dcon.link.command import RELAYS
 from dcon.link.counts import total
-from dcon.link.crossing import Failure, Item, PmuFrameIn
+from dcon.link.crossing import Item, PmuFrameIn
+from dcon.link.failure import Failure
 from dcon.session import checkpoint
 from dcon.session.codec import Timing
 from dcon.session.encode import tick_entries

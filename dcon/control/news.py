@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import LoopName, Readback, WatchdogState, WatchdogStatus, decode_readback, decode_status
 from dcon.link.counts import total
-from dcon.link.crossing import Failure
+from dcon.link.failure import Failure
 from dcon.link.news import GpsLock, LoopCounts, ServerWord, decode
 from dcon.session.codec import Watchdog
 

@@ -14,14 +14,15 @@ from typing import NamedTuple, Protocol
 
 from dcon.core.values import NOTHING, Order, Surroundings
 from dcon.link.bundle import Entry
-from dcon.link.crossing import Counts, Item
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import Item
 from dcon.session.head import Head
 
 
 class Frames(Protocol):
     """Where frames come from."""
 
-    counts: Counts
+    counts: FrontCounts
     """What did not become frames."""
 
     def wait(self, deadline_ns: int) -> None:

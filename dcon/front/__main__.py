@@ -10,7 +10,8 @@ from pathlib import Path
 from dcon.front.front import BEAT_NS, PRIORITY, Front, Outlet
 from dcon.front.receiving import Reception
 from dcon.link.beats import LoopName
-from dcon.link.crossing import Counts, Failure
+from dcon.link.counts import FrontCounts
+from dcon.link.failure import Failure
 from dcon.link.paths import WATCHDOG, Sender
 from dcon.link.pulse import Pulse
 from dcon.settings import load
@@ -27,7 +28,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--run-dir", type=Path, required=True)
     given = parser.parse_args(arguments)
     sock = socket.socket(fileno=given.fd)
-    counts = Counts()
+    counts = FrontCounts()
     outlet = Outlet(sock, counts)
     clock = SystemClock()
     try:

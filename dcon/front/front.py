@@ -12,7 +12,8 @@ import socket
 from collections import deque
 
 from dcon.front.receiving import Reception
-from dcon.link.crossing import Counts, Item, PmuFrameIn, encode
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import Item, PmuFrameIn, encode
 from dcon.link.pulse import Pulse
 from pmutools.clock import Clock
 from pmutools.flow import Chunk
@@ -33,7 +34,7 @@ PRIORITY = 9
 class Outlet:
     """One end of the pair. What it had no room for is counted in ``counts``."""
 
-    def __init__(self, sock: socket.socket, counts: Counts) -> None:
+    def __init__(self, sock: socket.socket, counts: FrontCounts) -> None:
         sock.setblocking(False)
         self._sock = sock
         self._counts = counts
@@ -74,7 +75,7 @@ class Outlet:
                     self._configs[pmu] = item
                 case PmuFrameIn():
                     self._counts.crowded += 1
-                case Counts():  # newer ones follow
+                case FrontCounts():  # newer ones follow
                     pass
                 case _:
                     self._news.append(item)
@@ -109,6 +110,6 @@ class Front:
             now_ns = clock.monotonic_ns()
         if now_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns = now_ns
-            outlet.add(Counts(**vars(reception.counts)))  # it also finds out whether anybody is there
+            outlet.add(FrontCounts(**vars(reception.counts)))  # it also finds out whether anybody is there
         outlet.flush()
         self._parse.beat(now_ns)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from dcon.link.crossing import Counts, Item, PmuFrameIn
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import Item, PmuFrameIn
 from pmutools.c37118 import FrameType, Message, StreamConfig
 from pmutools.c37118.config import is_fragment, whole
 from pmutools.c37118.constants import MAX_FRAME_SIZE
@@ -26,9 +27,9 @@ HELD_NS = NS
 class Reception:
     """The two loops of the front: :meth:`receive` and :meth:`parse`."""
 
-    def __init__(self, receivers: Receivers, counts: Counts | None = None) -> None:
+    def __init__(self, receivers: Receivers, counts: FrontCounts | None = None) -> None:
         self.receivers = receivers
-        self.counts = Counts() if counts is None else counts
+        self.counts = FrontCounts() if counts is None else counts
         self._unusable = 0
         """Frames that were read, and cannot be handed on, or rule nothing."""
         self._configs: dict[int, StreamConfig] = {}

@@ -1,12 +1,13 @@
 """What the processes count: what did not become what it was sent for. One list of names, for the log and for operators.
 
-The front tells its own through the pair (:class:`dcon.link.crossing.Counts`), the aides theirs as news; the control
+The front tells its own through the pair (:class:`FrontCounts`), the aides theirs as news; the control
 process adds what it counts itself, logs all of it each second (``/dcon/counts``), and sums up with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 COUNTS: Final[Mapping[str, str]] = {
@@ -45,8 +46,24 @@ USUAL: Final = frozenset(("repeated",))
 """A spontaneous sender repeats its configuration about once a minute."""
 
 
+@dataclass
+class FrontCounts:
+    """The front's share of :data:`COUNTS`, since its start."""
+
+    foreign: int = 0
+    undecodable: int = 0
+    held: int = 0
+    unreadable_yet: int = 0
+    unneeded: int = 0
+    repeated: int = 0
+    own_drops: int = 0
+    crowded: int = 0
+    overtaken_configs: int = 0
+    untold: int = 0
+
+
 def total(*counts: Mapping[str, int]) -> dict[str, int]:
-    """All of ``COUNTS``, added up by name; other names are left out."""
+    """All of ``COUNTS``, added up by name; other names, of another version's log, are left out."""
     return {name: sum(each.get(name, 0) for each in counts) for name in COUNTS}
 
 

@@ -12,12 +12,13 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+from dcon.link.counts import FrontCounts
+from dcon.link.failure import Failure
 from pmutools.c37118 import Frame
-from pmutools.errors import PmuError, SettingsError, SourceError
 from pmutools.flow import StampSource
 from pmutools.net.dialogue import LinkEvent, LinkKind
 
@@ -43,22 +44,6 @@ class Kind(IntEnum):
     """:class:`Failure`, as JSON: the front cannot go on."""
 
 
-@dataclass
-class Counts:
-    """What did not become frames of a tick, since the start: the front's share of :data:`dcon.link.counts.COUNTS`."""
-
-    foreign: int = 0
-    undecodable: int = 0
-    held: int = 0
-    unreadable_yet: int = 0
-    unneeded: int = 0
-    repeated: int = 0
-    own_drops: int = 0
-    crowded: int = 0
-    overtaken_configs: int = 0
-    untold: int = 0
-
-
 class PmuFrameIn(NamedTuple):
     """A frame of the PMU at a place of the settings; ``is_config`` says which kind."""
 
@@ -67,23 +52,7 @@ class PmuFrameIn(NamedTuple):
     is_config: bool = False
 
 
-class Failure(NamedTuple):
-    """The front, or the aides, have ended, and why."""
-
-    reason: str
-    is_mistake: bool = False
-    """Of a file that a user wrote: it would be the same again."""
-
-    @classmethod
-    def of(cls, error: PmuError) -> Failure:
-        return cls(str(error), isinstance(error, SettingsError))
-
-    @property
-    def error(self) -> PmuError:
-        return SettingsError(self.reason) if self.is_mistake else SourceError(self.reason)
-
-
-Item = PmuFrameIn | LinkEvent | Counts | Failure
+Item = PmuFrameIn | LinkEvent | FrontCounts | Failure
 _NEWS = ("kind", "where", "detail", "datagrams", "label")
 """What of a LinkEvent crosses."""
 
@@ -114,7 +83,7 @@ def _record(item: Item) -> bytes:
         case LinkEvent():
             said = {name: getattr(item, name) for name in _NEWS}
             return _text(Kind.NEWS, json.dumps(said))
-        case Counts():
+        case FrontCounts():
             return _text(Kind.COUNTS, json.dumps(asdict(item)))
         case Failure():
             return _text(Kind.FAILED, json.dumps(item))
@@ -151,10 +120,10 @@ def decode(message: bytes) -> Iterator[Item]:
             raise ValueError(f"no record of kind {kind}")
 
 
-def _said(kind: Kind, said: Any) -> LinkEvent | Counts | Failure:
+def _said(kind: Kind, said: Any) -> LinkEvent | FrontCounts | Failure:
     if kind == Kind.FAILED:
         reason, is_mistake = said
         return Failure(str(reason), is_mistake is True)
     if kind == Kind.NEWS:
         return LinkEvent(**said | {"kind": LinkKind(said["kind"]), "owners": ()})
-    return Counts(**{item.name: int(said[item.name]) for item in fields(Counts)})
+    return FrontCounts(**{item.name: int(said[item.name]) for item in fields(FrontCounts)})

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from dcon.core.values import Order, Pdci
 from dcon.link.beats import LoopName
 from dcon.link.counts import COUNTS
-from dcon.link.crossing import Failure
+from dcon.link.failure import Failure
 
 
 class GpsLock(NamedTuple):

@@ -17,8 +17,8 @@ class Pulse:
         """When the next is due."""
 
     def beat(self, now_ns: int, state: LoopState = LoopState.RUNNING) -> None:
-        """Send a beat where it is due, or says that the loop ends."""
-        if now_ns >= self.due_ns or state is LoopState.ENDING:
+        """Send a beat where it is due, or says that the loop does not go on."""
+        if now_ns >= self.due_ns or state is not LoopState.RUNNING:
             self._sender.send(encode_beat(self._loop, self._counter, now_ns, state))
             self._counter += 1
             self.due_ns = now_ns + self._period_ns

@@ -60,8 +60,6 @@ class Recorder:
         self.folder = folder
         self._limits = max_mb, max_minutes
         self.gaps = 0
-        self._senseless = 0
-        """Heads that were whole, and said nothing."""
         self._old = states.load(folder)
         self._earlier = dict(self._old.earlier) if self._old is not None else {}
         self._assembly = Assembly()
@@ -78,11 +76,6 @@ class Recorder:
     def resumes(self) -> Place:
         """What need not be sent again."""
         return self._assembly.place if self._writer is not None or self._old is None else self._old.place
-
-    @property
-    def malformed(self) -> int:
-        """Bundles that made no sense."""
-        return self._senseless + self._assembly.malformed
 
     def take(self, bundle: Bundle) -> None:
         """Record one bundle; one that was there before, or belongs to no session that is known, is left out."""
@@ -143,7 +136,6 @@ class Recorder:
             return
         head = head_of(pieces.bundles)
         if head is None:
-            self._senseless += 1
             return
         if self._writer is not None:
             self._writer.close()

@@ -11,13 +11,14 @@ from typing import Any
 
 from dcon.limiter import MW_PER_V
 from dcon.link import paths
-from dcon.link.beats import LoopName, LoopState, encode_beat
+from dcon.link.beats import LoopName, LoopState
 from dcon.link.bundle import Bundle
 from dcon.link.keys import read_keys
 from dcon.link.news import ServerWord, encode
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
+from dcon.link.pulse import Pulse
 from dcon.server.around import LineSource
 from dcon.server.desk import Desk
 from dcon.server.intake import Intake
@@ -33,7 +34,6 @@ from pmutools.clock import Clock, SystemClock
 from pmutools.timebase import NS
 
 LOG = logging.getLogger(__name__)
-BEAT_NS = NS // 10
 NEWS_NS = NS // 2
 BREATH_NS = NS // 100
 SILENT_S = 2.0
@@ -84,6 +84,7 @@ class Server:
         self._selector.register(self._replies, selectors.EVENT_READ, self._reply)
         self._selector.register(self._word.sock, selectors.EVENT_READ, lambda _, now_ns, __: self._word.hear(now_ns))
         self._watchdog = Sender(self.folder / paths.WATCHDOG)
+        self._pulse = Pulse(LoopName.SERVER, self._watchdog)
         self._control = Sender(self.folder / paths.CONTROL)
         self.desk = Desk(self.folder, self.status, verifier)
         self.desk.reply_to = str(self.folder / paths.REPLIES)
@@ -93,26 +94,23 @@ class Server:
         self._looked_ns = 0
         """When that was, monotonic."""
         self._found: Response | None = None
-        self._beats = 0
 
     def run(self) -> None:
         """Serve until :attr:`stopping`; then write what has come, and end the log."""
         clock = self.clock
-        beat_ns = news_ns = clock.monotonic_ns()
+        news_ns = clock.monotonic_ns()
         self._notifier.tell(READY)
         try:
             while not self.stopping:
                 now_ns = clock.monotonic_ns()
-                for key, events in self._selector.select(min(max(beat_ns - now_ns, 0) / 1e9, 0.05)):
+                for key, events in self._selector.select(min(max(self._pulse.due_ns - now_ns, 0) / 1e9, 0.05)):
                     self._safely(key.data, events)
                 now_ns = clock.monotonic_ns()
                 self._acknowledge()
                 self.operators.answer(self.desk.pending.expired(now_ns))
                 if not self._scribe.has_room:  # what waits to be read would wake us again and again
                     clock.sleep_until(now_ns + BREATH_NS)
-                if now_ns >= beat_ns:
-                    beat_ns = now_ns + BEAT_NS
-                    self._beat(LoopState.RUNNING)
+                self._pulse.beat(now_ns)
                 if now_ns >= news_ns:
                     news_ns = now_ns + NEWS_NS
                     self._tell(now_ns)
@@ -166,7 +164,7 @@ class Server:
 
     def close(self) -> None:
         self._notifier.tell(STOPPING)
-        self._beat(LoopState.ENDING)
+        self._pulse.beat(self.clock.monotonic_ns(), LoopState.ENDING)
         if not self._scribe.close():
             LOG.error("the disk does not take the log; %d bytes are not written", self._scribe.waiting)
         self._acknowledge()
@@ -216,10 +214,6 @@ class Server:
 
     def _hangs(self) -> bool:
         return self._scribe.hangs(SILENT_S)
-
-    def _beat(self, state: LoopState) -> None:
-        self._beats += 1
-        self._watchdog.send(encode_beat(LoopName.SERVER, self._beats, self.clock.monotonic_ns(), state))
 
     def _tell(self, now_ns: int) -> None:
         """News for the controller, none where the log hangs; and a status for who watches."""

@@ -50,10 +50,10 @@ def decode_checkpoint(message: Any | None) -> Memory | None:
     if message is None or message.layout != LAYOUT:
         return None
     try:
-        memory = _made(Memory, json.loads(message.memory))
+        memory: Memory = _made(Memory, json.loads(message.memory))
     except (ValueError, TypeError, RecursionError):
         return None
-    return memory if isinstance(memory, Memory) else None
+    return memory
 
 
 def _pair(value: object) -> list[float]:
@@ -77,8 +77,10 @@ def _made(kind: Any, value: Any) -> Any:
         return value
     if origin in (Union, UnionType):
         return None if value is None else _made(_given(args), value)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return kind(value)
     if not isinstance(value, list):
-        return kind(value)  # an enumeration, by its text
+        raise ValueError(f"{value!r} is no list")
     if kind is complex:
         real, imag = value
         return complex(_made(float, real), _made(float, imag))

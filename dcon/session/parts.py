@@ -32,8 +32,6 @@ class Part(NamedTuple):
     session: str
     """"" where the log does not say: then there is only this file."""
     number: int
-    after: str
-    """Name of the part before; "" for the first."""
     unlogged: int
     """Ticks that were not logged just before this part."""
 
@@ -79,7 +77,6 @@ def part_of(path: str | os.PathLike[str]) -> Part:
         log,
         values.get(SESSION, ""),
         _count(values.get("part"), 1),
-        values.get("continues", ""),
         _count(values.get("unlogged_ticks"), 0),
     )
 

@@ -235,8 +235,7 @@ def is_fragment(frame: bytes) -> bool:
 
 def whole(frame: bytes, config: StreamConfig) -> bytes:
     """What says ``config`` by itself: the frame that it came with, or all fragments, where that is one of them."""
-    is_part = config.kind is FrameType.CFG3 and frame[PREFIX_SIZE : PREFIX_SIZE + 2] != b"\0\0"
-    return encode_config(config) if is_part else frame
+    return encode_config(config) if is_fragment(frame) else frame
 
 
 def frames_in(data: bytes) -> list[bytes]:

@@ -188,6 +188,8 @@ SENSELESS = {
     "a state that is none": text_with("ASLEEP", 0, 2),
     "half a complex number": text_with([1.0], 0, 0, 0, 4),
     "no list": text_with(7, 0, 0),
+    "text for a list": text_with("abc", 0, 0),
+    "a number in a list of lists": text_with("abc", 0, 0, 0),
     "very deep": "[" * 100_000,
 }
 

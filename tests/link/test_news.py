@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dcon.core.values import Order, Pdci
 from dcon.link.beats import LoopName
 from dcon.link.counts import COUNTS
-from dcon.link.crossing import Failure
+from dcon.link.failure import Failure
 from dcon.link.news import GpsLock, LoopCounts, News, ServerWord, decode, encode
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)

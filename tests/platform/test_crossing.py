@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import socket
 from contextlib import suppress
+from dataclasses import fields
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.link.crossing import MESSAGE_BYTES, Counts, Failure, Item, PmuFrameIn, decode, encode
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import MESSAGE_BYTES, Item, PmuFrameIn, decode, encode
+from dcon.link.failure import Failure
 from pmutools.c37118 import Frame
 from pmutools.flow import StampSource
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -26,7 +29,7 @@ WORDS = st.text(max_size=50)
 NEWS = st.builds(
     LinkEvent, st.sampled_from(list(LinkKind)), WORDS, st.just(()), WORDS, st.none(), st.none(), st.integers(0, 99)
 )
-COUNTS = st.builds(Counts, *[st.integers(0, 1 << 40)] * 4)
+COUNTS = st.builds(FrontCounts, **{item.name: st.integers(0, 1 << 40) for item in fields(FrontCounts)})
 ITEMS = st.lists(st.one_of(FRAMES, NEWS, COUNTS, st.builds(Failure, WORDS, st.booleans())), max_size=20)
 
 

@@ -23,7 +23,9 @@ from dcon.front.front import KEPT, PARSE_NS, ROUND_NS, Front, Outlet
 from dcon.front.receiving import Reception
 from dcon.link.beats import LoopName
 from dcon.link.children import launch
-from dcon.link.crossing import Counts, Failure, Item, PmuFrameIn, decode
+from dcon.link.counts import FrontCounts
+from dcon.link.crossing import Item, PmuFrameIn, decode
+from dcon.link.failure import Failure
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
 from dcon.settings import parse
@@ -55,7 +57,7 @@ class Rig:
         ours, self.theirs = pair(SMALL_BYTES)
         self.frames = PairFrames(ours, CLOCK)
         self.ours = ours
-        self.counts = Counts()
+        self.counts = FrontCounts()
         self.receivers = Receivers([site.endpoint for site in settings.sites], CLOCK)
         sender = Sender(folder / "watchdog.in")
         pulses = (Pulse(name, sender) for name in (LoopName.UDP, LoopName.PARSE))
@@ -274,7 +276,7 @@ def test_data_never_overtake_a_configuration_that_found_no_room() -> None:
     ours, theirs = pair(SMALL_BYTES)
     with ours, theirs:
         ours.setblocking(False)
-        outlet = Outlet(theirs, Counts())
+        outlet = Outlet(theirs, FrontCounts())
         big, data = Frame(bytes(60_000), 1, StampSource.KERNEL, 0), Frame(b"d", 1, StampSource.KERNEL, 0)
         sent = 0
         while outlet._counts.crowded == 0:
@@ -302,7 +304,7 @@ def test_news_without_end_push_no_configuration_out() -> None:
     ours, theirs = pair(SMALL_BYTES)
     with ours, theirs:
         ours.setblocking(False)
-        outlet = Outlet(theirs, Counts())
+        outlet = Outlet(theirs, FrontCounts())
         while not outlet._counts.crowded:
             outlet.add(PmuFrameIn(0, Frame(bytes(60_000), 1, StampSource.KERNEL, 0)))
             outlet.flush()
@@ -325,7 +327,7 @@ def test_news_without_end_push_no_configuration_out() -> None:
 def test_news_that_wait_are_bounded() -> None:
     ours, theirs = pair(SMALL_BYTES)
     with ours, theirs:
-        outlet = Outlet(theirs, Counts())
+        outlet = Outlet(theirs, FrontCounts())
         for number in range(5 * KEPT):
             outlet.add(LinkEvent(LinkKind.FOREIGN, f"{number}", ()))
             if number % 100 == 0 or number < KEPT:
@@ -406,7 +408,7 @@ def test_a_frame_of_a_capture_keeps_its_source() -> None:
     """Stamps of all sources cross the pair."""
     ours, theirs = pair()
     with ours, theirs:
-        outlet = Outlet(theirs, Counts())
+        outlet = Outlet(theirs, FrontCounts())
         frames = [PmuFrameIn(3, Frame(b"x", 5, source, 0)) for source in StampSource]
         for item in frames:
             outlet.add(item)
