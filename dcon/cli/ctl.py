@@ -49,14 +49,14 @@ def command(
     An order is signed, and answered when a tick has taken it. estop goes to the watchdog too; release and reset open
     the way for closing its relays again, and arm nothing. Exit code 0: done; 1: refused, or nobody answers.
     """
-    from dcon.cli import shown
+    from dcon.cli import status_text
     from dcon.server.client import Client, ask
     from pmutools.errors import SettingsError
     from pmutools.net.endpoint import parse_endpoint
 
     talk = Talk(quiet, verbose)
     where = parse_endpoint(to if "://" in to else f"tcp://{to}")
-    show: Callable[[dict[str, Any]], str] = json.dumps if as_json else shown.text
+    show: Callable[[dict[str, Any]], str] = json.dumps if as_json else status_text.text
     if verb in LOOKS:
         if words:
             raise SettingsError(f"{verb} takes no value")
@@ -66,7 +66,7 @@ def command(
         with Client(where) as client:
             client.send({"ask": "watch"})
             for status in client.answers():
-                click.echo(json.dumps(status) if as_json else shown.line(status))
+                click.echo(json.dumps(status) if as_json else status_text.line(status))
     return _order(_signed(verb, words, who, key, why), where, talk, as_json)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from dcon.control.news import HELPERS, Heard, is_silent
+from dcon.control.heard import HELPERS, Heard, is_silent
 from dcon.link.children import HUNG_S
 from pmutools.timebase import NS
 

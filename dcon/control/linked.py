@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dcon.control import hanging
 from dcon.control.hanging import Silences, hung, look
-from dcon.control.news import Heard, counted, hear, is_there, surroundings, watchdog_of
+from dcon.control.heard import Heard, counted, hear, is_there, surroundings, watchdog_of
 from dcon.control.ports import Ends, Told
 from dcon.core.values import Order
 from dcon.limiter import MW_PER_V

@@ -36,12 +36,12 @@ class Kind(IntEnum):
     """A data frame that is to be read by the PMU's newest configuration."""
     CONFIG = 1
     """A configuration frame that says something new."""
-    NEWS = 2
+    EVENT = 2
     """A :class:`~pmutools.net.dialogue.LinkEvent`, as JSON."""
     COUNTS = 3
-    """:class:`Counts` so far, as JSON."""
+    """:class:`~dcon.link.counts.FrontCounts` so far, as JSON."""
     FAILED = 4
-    """:class:`Failure`, as JSON: the front cannot go on."""
+    """:class:`~dcon.link.failure.Failure`, as JSON: the front cannot go on."""
 
 
 class PmuFrameIn(NamedTuple):
@@ -53,7 +53,7 @@ class PmuFrameIn(NamedTuple):
 
 
 Item = PmuFrameIn | LinkEvent | FrontCounts | Failure
-_NEWS = ("kind", "where", "detail", "datagrams", "label")
+_EVENT_FIELDS = ("kind", "where", "detail", "datagrams", "label")
 """What of a LinkEvent crosses."""
 
 
@@ -81,8 +81,8 @@ def _record(item: Item) -> bytes:
             source = _SOURCE_NUMBERS[frame.stamp_source]
             return _HEAD.pack(kind, source, pmu, frame.arrival_ns or 0, len(frame.data)) + frame.data
         case LinkEvent():
-            said = {name: getattr(item, name) for name in _NEWS}
-            return _text(Kind.NEWS, json.dumps(said))
+            said = {name: getattr(item, name) for name in _EVENT_FIELDS}
+            return _text(Kind.EVENT, json.dumps(said))
         case FrontCounts():
             return _text(Kind.COUNTS, json.dumps(asdict(item)))
         case Failure():
@@ -124,6 +124,6 @@ def _said(kind: Kind, said: Any) -> LinkEvent | FrontCounts | Failure:
     if kind == Kind.FAILED:
         reason, is_mistake = said
         return Failure(str(reason), is_mistake is True)
-    if kind == Kind.NEWS:
+    if kind == Kind.EVENT:
         return LinkEvent(**said | {"kind": LinkKind(said["kind"]), "owners": ()})
     return FrontCounts(**{item.name: int(said[item.name]) for item in fields(FrontCounts)})

@@ -15,7 +15,7 @@ from typing import Any
 from dcon.link.beats import Verb, encode_word
 from dcon.link.orders import LONGEST, SignedOrder, Verifier
 from dcon.link.paths import AIDE, WATCHDOG, Sender
-from dcon.server.newest import News
+from dcon.server.newest import TickSummary
 from dcon.server.pending import Answer, Pending
 
 LOG = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class Desk:
                 return self._signed(asker, text, utc_ns, now_ns)
         return _error(f"ask for one of {', '.join(ASKS)}, or send a signed order")
 
-    def heard(self, news: News) -> list[Answer]:
+    def heard(self, news: TickSummary) -> list[Answer]:
         return self.pending.heard(news)
 
     def reply(self, datagram: bytes) -> list[Answer]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from typing import Any, NamedTuple
@@ -12,8 +11,7 @@ from google.protobuf.message import DecodeError
 from dcon.core.values import Event, InstanceState, Order, Surroundings
 from dcon.link.bundle import Bundle, Entry
 from dcon.link.counts import total
-from dcon.server.around import NO_LINE, LineSource, line_of, text_of
-from dcon.server.told import shown
+from dcon.server.status import NO_LINE, LineExpected, flag_text, line_of, watchdog_of
 from dcon.session import codec
 from dcon.session.head import Head
 from pmutools.schema.descriptors import message_class
@@ -28,7 +26,7 @@ SHOWN = frozenset(
 )
 
 
-class News(NamedTuple):
+class TickSummary(NamedTuple):
     """What one tick tells of orders and of the line."""
 
     tick_ns: int = 0
@@ -43,7 +41,7 @@ class News(NamedTuple):
 class Newest:
     """The last tick, the flag register and the last events of a session. Memory: bounded by the numbers above."""
 
-    def __init__(self, head: Head, source: LineSource = NO_LINE) -> None:
+    def __init__(self, head: Head, source: LineExpected = NO_LINE) -> None:
         """``source`` of the line's status."""
         self.head = head
         self._source = source
@@ -54,9 +52,9 @@ class Newest:
         self._flags: dict[tuple[str, str], Any] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
 
-    def take(self, bundle: Bundle) -> News:
+    def take(self, bundle: Bundle) -> TickSummary:
         """Take in a tick."""
-        news = News(bundle.tick_ns)
+        news = TickSummary(bundle.tick_ns)
         orders: list[Order] = []
         events: list[Event] = []
         for entry in bundle.entries:
@@ -139,7 +137,7 @@ class Newest:
             {
                 "name": flag.name,
                 "subject": flag.subject,
-                "text": text_of(flag.name, told, line),
+                "text": flag_text(flag.name, told, line),
                 "up": flag.up,
                 "latched": flag.latched,
                 "acknowledged": flag.acknowledged,
@@ -153,7 +151,7 @@ class Newest:
         heard = {flag.name for flag in known}
         for place, name in enumerate(self.head.flags):
             if tick.flags >> place & 1 and name not in heard:
-                shown.append({"name": name, "subject": "", "text": text_of(name, told, line), "up": True})
+                shown.append({"name": name, "subject": "", "text": flag_text(name, told, line), "up": True})
         return shown
 
     def _instances(self) -> list[dict[str, Any]]:
@@ -178,7 +176,7 @@ class Newest:
         watchdog = self._last.get("Watchdog")
         if watchdog is None:
             return None
-        return shown(
+        return watchdog_of(
             watchdog.silent or is_old,
             source="log",
             age_ms=max(utc_ns - watchdog.time_ns, 0) / 1e6,
@@ -203,17 +201,3 @@ class Newest:
 
 def _shown(told: Surroundings) -> dict[str, Any]:
     return {name: value for name, value in told._asdict().items() if name not in ("pdci", "unread")}
-
-
-def _finite(value: Any) -> Any:
-    """With None for what is no number: JSON has no NaN, and no infinity."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def to_json(values: dict[str, Any]) -> bytes:
-    """One line; what is no finite number is null."""
-    return json.dumps(_finite(values), separators=(",", ":"), allow_nan=False).encode() + b"\n"

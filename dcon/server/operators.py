@@ -16,8 +16,8 @@ from typing import Any
 
 from dcon.server.client import CROWDED_OUT
 from dcon.server.desk import Desk
-from dcon.server.newest import to_json
 from dcon.server.pending import Answer
+from dcon.server.status import to_json
 from pmutools.net.endpoint import Endpoint
 from pmutools.net.sockets import Address, listening_socket, resolve
 from pmutools.timebase import NS

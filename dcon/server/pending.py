@@ -9,7 +9,7 @@ from dcon.core.orders import SYSTEM
 from dcon.core.system import LINK_REFUSED
 from dcon.core.values import Order
 from dcon.link.orders import ANSWER_NS, Refused, digest, read
-from dcon.server.newest import News
+from dcon.server.newest import TickSummary
 
 MOST = 256
 """On their way at once."""
@@ -54,7 +54,7 @@ class Pending:
     def awaits(self, asker: Hashable) -> bool:
         return any(waiting.asker == asker for waiting in self._waiting)
 
-    def heard(self, news: News) -> list[Answer]:
+    def heard(self, news: TickSummary) -> list[Answer]:
         """Answers that a tick gives."""
         if not news.orders or not self._waiting:
             return []

@@ -19,15 +19,15 @@ from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from dcon.link.orders import Verifier
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
-from dcon.server.around import LineSource
 from dcon.server.desk import Desk
 from dcon.server.intake import Intake
-from dcon.server.newest import Newest, to_json
+from dcon.server.newest import Newest
 from dcon.server.operators import Operators
 from dcon.server.recorder import Recorder, Report
 from dcon.server.response import LineResponse, Response
 from dcon.server.scribe import Scribe
-from dcon.server.told import WatchdogWord
+from dcon.server.status import LineExpected, to_json
+from dcon.server.watchdog_word import WatchdogWord
 from dcon.session.head import Head
 from dcon.settings import Settings
 from pmutools.clock import Clock, SystemClock
@@ -65,7 +65,7 @@ class Server:
         keys = read_keys(settings.server.keys) if settings.server.keys is not None else {}
         # it remembers no sequences of an earlier life: what was signed before this one is not told to the watchdog
         verifier = Verifier(keys, window_ns=round(settings.server.window_s * NS), floor_ns=self.clock.realtime_ns())
-        self._line = LineSource(
+        self._line = LineExpected(
             settings.line_input.url is not None or settings.params.required.line, settings.params.line.status_age_s
         )
         self.newest = Newest(Head(""), self._line)

@@ -14,7 +14,7 @@ from dcon.aides.line import PdciAide
 from dcon.aides.order_gate import OrderGate
 from dcon.aides.orders import GuiAide
 from dcon.control import loop
-from dcon.control.news import Heard, counted
+from dcon.control.heard import Heard, counted
 from dcon.link import paths
 from dcon.link.counts import COUNTS, USUAL, FrontCounts, total, words
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dcon.control.hanging import HUNG_NS, Silences, hung, look
-from dcon.control.news import HELPERS, Heard, hear
+from dcon.control.heard import HELPERS, Heard, hear
 from dcon.link.beats import UNHEARD, LoopName
 from dcon.watchdog.codec import encode_status
 

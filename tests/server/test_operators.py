@@ -18,7 +18,7 @@ import pytest
 from support.operated import FakePlatform
 from support.shipped import ServerProcess, eventually
 
-from dcon.cli import dcon, shown
+from dcon.cli import dcon, status_text
 from dcon.link import paths
 from dcon.link.beats import CAUSES as CAUSE_BITS
 from dcon.link.keys import add_key, read_keys
@@ -196,7 +196,7 @@ def test_what_the_watchdog_says_and_why(site: Site) -> None:
         site.until(lambda at=watchdog.time_ns: (site.status()["watchdog"] or {}).get("time_ns") == at)
         said = site.status()["watchdog"]
         assert said["source"] == "log" and said["age_ms"] > 1e6
-        assert said["causes"] == causes and shown.relays({**said, "age_ms": 4000.0}) == line
+        assert said["causes"] == causes and status_text.relays({**said, "age_ms": 4000.0}) == line
 
 
 def test_a_controller_that_hangs_is_told_in_the_first_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,7 +213,7 @@ def test_a_controller_that_hangs_is_told_in_the_first_line(site: Site, capsys: p
         first, second, third, *_ = capsys.readouterr().out.splitlines()
         assert re.match(r"OLD, by [12]\.\d s: the controller is silent", first)
         assert second.startswith("last known: ") and third.startswith("last known: command ")
-        assert shown.line(site.status()).startswith("OLD, by ")
+        assert status_text.line(site.status()).startswith("OLD, by ")
         watchdog = site.status()["watchdog"]  # None where no test before has let it say anything
         assert watchdog is None or (watchdog["relays_closed"] is None and watchdog["silent"])
     finally:
@@ -230,12 +230,12 @@ def test_the_watchdog_s_own_word_counts_and_ages(site: Site) -> None:
     said = site.status()["watchdog"]
     assert (said["source"], said["relays_closed"], said["latched"], said["estop"]) == ("watchdog", False, True, False)
     assert said["causes"] == ["control"] and 0 <= said["age_ms"] <= 100 and not said["silent"]
-    assert shown.relays(said).startswith("relays open; tripped; causes: control")
+    assert status_text.relays(said).startswith("relays open; tripped; causes: control")
     site.until(lambda: site.status()["watchdog"]["silent"])  # one from the future ages too
     said = site.status()["watchdog"]
     assert said["age_ms"] > 100 and said["source"] == "watchdog"
     assert said["relays_closed"] is said["latched"] is said["estop"] is said["causes"] is None
-    assert shown.relays(said).startswith(SILENT) and shown.relays(said).endswith(
+    assert status_text.relays(said).startswith(SILENT) and status_text.relays(said).endswith(
         "relays open; tripped; causes: control"
     )
     assert site.status()["server"]["malformed"] == 1

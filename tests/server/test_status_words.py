@@ -9,18 +9,17 @@ from typing import Any
 import pytest
 from support.sessions import HEAD, INSTANCES, T0, random_ticks
 
-from dcon.cli import shown
+from dcon.cli import status_text
 from dcon.core.rows import CORE
 from dcon.core.values import Flag, Pdci, Surroundings, SystemState
 from dcon.link.bundle import Bundle, Kind
 from dcon.link.counts import COUNTS
-from dcon.server.around import LineSource
-from dcon.server.newest import Newest, to_json
-from dcon.server.told import shown as watchdog_shown
+from dcon.server.newest import Newest
+from dcon.server.status import LineExpected, to_json, watchdog_of
 from dcon.session.encode import tick_entries
 from pmutools.timebase import NS
 
-HERE = LineSource(True, 2.0)
+HERE = LineExpected(True, 2.0)
 LINE = Pdci(T0 - NS // 10, 2012.25, True, True, 2000.0)
 SAID = {"power_mw": 2012.25, "scheduled_mw": 2000.0, "in_service": True, "dcon_enabled": True}
 LOG: dict[str, Any] = {"file": "/a/s.mcap", "lag_s": 0.3, "unlogged_ticks": 0, "disk_free_percent": 41.2}
@@ -30,7 +29,7 @@ LOG |= {"hangs": False, "refused": False}
 def status(
     told: Surroundings = Surroundings(),  # noqa: B008  # a tuple
     *flags: Flag,
-    source: LineSource = HERE,
+    source: LineExpected = HERE,
     after_ns: int = 0,
     counts: dict[str, int] | None = None,
     watchdog: dict[str, Any] | None = None,
@@ -56,7 +55,7 @@ def up(name: str, value: float = 0.0) -> Flag:
 
 
 def lines(*given: Any, **named: Any) -> list[str]:
-    return shown.text(status(*given, **named)).splitlines()
+    return status_text.text(status(*given, **named)).splitlines()
 
 
 def one(beginning: str, text: list[str]) -> str:
@@ -98,8 +97,8 @@ def test_a_line_that_never_told_its_status() -> None:
     assert told["known"] is False and told["age_s"] is told["power_mw"] is told["last_said"] is None
     assert one("line ", lines()) == "line NOT KNOWN: it has never told its status"
     assert one("up", lines(Surroundings(), up("line_out", math.nan))).endswith("is not known, and never was")
-    assert status(source=LineSource())["line"] is None
-    assert not [line for line in lines(source=LineSource()) if line.startswith("line")]
+    assert status(source=LineExpected())["line"] is None
+    assert not [line for line in lines(source=LineExpected()) if line.startswith("line")]
 
 
 def test_a_line_that_tells_no_schedule() -> None:
@@ -123,7 +122,7 @@ def test_a_check_of_what_nobody_has_told_says_so(name: str, told: dict[str, Any]
 
 def watchdog(latched: bool, silent: bool = False, age_ms: float = 20.0) -> dict[str, Any]:
     said = {"relays_closed": not latched, "estop": False, "latched": latched, "causes": ["control"] if latched else []}
-    return watchdog_shown(silent, **said, age_ms=age_ms, beats_ms={})  # type: ignore[arg-type]
+    return watchdog_of(silent, **said, age_ms=age_ms, beats_ms={})  # type: ignore[arg-type]
 
 
 def test_the_first_line_has_a_trip_whatever_the_controller_s_last_word_was() -> None:
@@ -133,15 +132,15 @@ def test_the_first_line_has_a_trip_whatever_the_controller_s_last_word_was() -> 
     assert first.startswith("OLD, by 6.0 s, and the watchdog has TRIPPED: ") and second.startswith("last known: ACTIVE")
     silent = lines(watchdog=watchdog(True, silent=True))
     assert silent[0].startswith("the watchdog had TRIPPED when it was last heard; the controller: ACTIVE, ")
-    assert shown.line(status(watchdog=watchdog(True))).startswith("the watchdog has TRIPPED; ACTIVE ")
-    both = shown.line(status(watchdog=watchdog(True), after_ns=6 * NS))
+    assert status_text.line(status(watchdog=watchdog(True))).startswith("the watchdog has TRIPPED; ACTIVE ")
+    both = status_text.line(status(watchdog=watchdog(True), after_ns=6 * NS))
     assert both.startswith("OLD, by 6.0 s; the watchdog has TRIPPED; last known: ACTIVE ")
 
 
 def test_a_trip_before_any_controller_was_heard() -> None:
     newest = Newest(HEAD, HERE).status(T0, True)
     whole = {"controller_connected": False, "tick_age_ms": None, **newest, "watchdog": watchdog(True), "log": LOG}
-    assert shown.text(whole).splitlines()[0] == "the watchdog has TRIPPED; no controller has been heard yet"
+    assert status_text.text(whole).splitlines()[0] == "the watchdog has TRIPPED; no controller has been heard yet"
 
 
 # --- the rest ------------------------------------------------------------------------------------------------------
@@ -152,14 +151,14 @@ def test_numbers_that_are_not_known_are_said_so() -> None:
     said = lines(**nan)
     assert "gain not known MW/mHz" in said[0]
     assert said[1] == "command not known MW, output not known V, probe not known MW"
-    assert "not known MW not known V" in shown.line(status(**nan))
+    assert "not known MW not known V" in status_text.line(status(**nan))
 
 
 def test_a_log_that_is_not_there_is_not_behind() -> None:
     assert lines()[-1] == "log /a/s.mcap, 0.3 s behind, 0 ticks missing, disk 41 % free"
     none = {"file": "", "lag_s": None, "unlogged_ticks": 60, "disk_free_percent": None}
     assert lines(log=none)[-1] == "no log, 60 ticks missing"
-    assert "  no log" in shown.line(status(log=none)) and "log 0.3 s behind" in shown.line(status())
+    assert "  no log" in status_text.line(status(log=none)) and "log 0.3 s behind" in status_text.line(status())
     assert ", the disk hangs, " in lines(log={"hangs": True})[-1]
     assert ", the system lets nothing be written, " in lines(log={"refused": True})[-1]
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from dcon.control.news import GPS_NS, SERVER_NS, Heard, counted, hear, is_healthy, is_there, surroundings, watchdog_of
+from dcon.control.heard import GPS_NS, SERVER_NS, Heard, counted, hear, is_healthy, is_there, surroundings, watchdog_of
 from dcon.core.values import Order, Pdci, Surroundings
 from dcon.link.beats import UNHEARD, Readback, WatchdogState, encode_readback
 from dcon.link.counts import COUNTS

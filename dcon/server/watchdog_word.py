@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Sequence
 from typing import Any
 
 from dcon.link.beats import WatchdogState, WatchdogStatus, decode_status
+from dcon.server.status import watchdog_of
 
 STATUSES_A_ROUND = 64
 """Taken at once."""
@@ -44,7 +44,7 @@ class WatchdogWord:
         if status is None:
             return None
         age_ns = max(now_ns - self._at_ns, 0)
-        return shown(
+        return watchdog_of(
             age_ns > self.patience_ns,
             source="watchdog",
             age_ms=age_ns / 1e6,
@@ -55,12 +55,3 @@ class WatchdogWord:
             causes=status.causes,
             beats_ms=dict(status.beats_ms),
         )
-
-
-def shown(
-    silent: bool, *, relays_closed: bool, estop: bool, latched: bool, causes: Sequence[str], **others: Any
-) -> dict[str, Any]:
-    """The ``watchdog`` of a status. Of one that is silent nothing is known but what it said last."""
-    said = {"relays_closed": relays_closed, "estop": estop, "latched": latched, "causes": list(causes)}
-    now = dict.fromkeys(said) if silent else said
-    return {**now, "silent": silent, "reason": " ".join(causes), "last_said": said, **others}
