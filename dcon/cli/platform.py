@@ -18,7 +18,8 @@ from pmutools.errors import SettingsError, SourceError
 from pmutools.parsers import number
 
 if TYPE_CHECKING:
-    from dcon.control.loop import Platform, Summary
+    from dcon.control.loop import Platform
+    from dcon.control.summary import Summary
     from dcon.engine import Tick
     from dcon.link.notify import Notifier
     from dcon.settings import Settings

@@ -16,11 +16,11 @@ import gc
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 from dcon.control.orders import OrderBook, TimedOrder
 from dcon.control.ports import Ends, Log, Told
 from dcon.control.schedule import TickGrid
+from dcon.control.summary import Summary
 from dcon.control.waiting import Waiting
 from dcon.core.rows import CORE
 from dcon.core.system import ENGAGED, Trigger
@@ -66,33 +66,6 @@ TROUBLE = frozenset(
     )
 )
 _DISARM = (Order(str(Trigger.DISARM)),)
-
-
-@dataclass
-class Summary:
-    """How a session went."""
-
-    ticks: int = 0
-    late_over_1ms: int = 0
-    caught_up_ticks: int = 0
-    """Ticks that ran later than the one after them should have."""
-    skipped_ticks: int = 0
-    """Ticks left out, after a pause of the machine or a step of UTC."""
-    clock_steps: int = 0
-    frames: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    """What did not become what it was sent for (:data:`dcon.link.counts.COUNTS`)."""
-    unread: dict[str, int] = field(default_factory=dict)
-    """Those of the counts, by PMU."""
-    session: int = 0
-    """Number of the session at the server; 0 where this process writes the log."""
-    unlogged_ticks: int = 0
-    """Ticks that the log had no room for."""
-    log_parts: list[str] = field(default_factory=list)
-    """Files of the session log, where this process writes it."""
-    final_state: str = ""
-    trouble: str = ""
-    """Why the session ended, where nobody wanted it to."""
 
 
 class Platform:
@@ -234,9 +207,13 @@ class Platform:
         counts, is_due = None, checkpoint.is_due(self.summary.ticks, self.settings.params.tick_hz)
         if record.tick_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns, counts = record.tick_ns, self._counts()
-        given, memory = (names, record, tick.readings, orders), tick.memory if is_due else None
-        around = tick.surroundings
-        entries = tick_entries(*given, timing=timing, counts=counts, surroundings=around, memory=memory)
+        entries = tick_entries(
+            *(names, record, tick.readings, orders),
+            timing=timing,
+            counts=counts,
+            surroundings=tick.surroundings,
+            memory=tick.memory if is_due else None,
+        )
         log.write(entries, record.tick_ns)
 
     def _counts(self) -> dict[str, int]:

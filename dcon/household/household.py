@@ -19,8 +19,8 @@ from pathlib import Path
 from types import FrameType
 
 from dcon.household.ear import ear_of
-from dcon.household.member import ENDED, PLATFORM, STARTED, Lives
-from dcon.household.places import await_places
+from dcon.household.member import ENDED, PLATFORM, STARTED, Supervised
+from dcon.household.predecessor import await_places
 from dcon.link.children import HUNG_S, ending
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
 from pmutools.errors import SourceError
@@ -33,7 +33,7 @@ ROUND_S = 1.0
 FAILED, USAGE = 1, 2
 """Exit codes of a process that has said why; of the latter it was set up wrongly, and would be the same again."""
 MOST_SAID = 256
-"""Lives of one process whose last words are kept."""
+"""Supervised of one process whose last words are kept."""
 DONE = (0, 3)
 """Exit codes of a controller whose time is over."""
 
@@ -92,7 +92,7 @@ class Household:
         self._is_over = is_over
         self._commands = commands
         self._notifier = notifier or Notifier({})
-        self._running: dict[str, Lives] = {}
+        self._running: dict[str, Supervised] = {}
         self._poll = select.poll()
         self._round_s = time.monotonic()
         self._wake, self._woken = os.pipe()
@@ -122,7 +122,7 @@ class Household:
             for member in needed:
                 if self.stopping or self._over:
                     break
-                each = self._running[member.name] = Lives(member, self.folder, self._poll)
+                each = self._running[member.name] = Supervised(member, self.folder, self._poll)
                 each.start(self._commands[member.name]())
                 while not (each.was_ready or self.stopping or self._over):
                     self._round()
@@ -179,7 +179,7 @@ class Household:
         missing = [name for name, each in self._running.items() if each.process is None]
         self._notifier.tell(ALIVE, status=f"waiting to restart {', '.join(missing)}" if missing else "running")
 
-    def _judge(self, each: Lives) -> None:
+    def _judge(self, each: Supervised) -> None:
         """Kill one that hangs."""
         ear, name = each.ear, each.member.name
         limit_s = HUNG_S if ear.is_ready else START_S
@@ -190,7 +190,7 @@ class Household:
         LOG.error("the %s process has not beaten for %g s, and is killed", name, limit_s)
         each.kill()
 
-    def _bury(self, each: Lives) -> None:
+    def _bury(self, each: Supervised) -> None:
         """It has ended: is that the end of the run, or when is it to be started again?
 
         Raises SourceError where it never was ready: it would be the same again.
@@ -204,12 +204,12 @@ class Household:
         else:
             self._put_off(each, f"the {each.member.name} process has ended, {ending(code)}")
 
-    def _put_off(self, each: Lives, why: str) -> None:
+    def _put_off(self, each: Supervised, why: str) -> None:
         name = each.member.name
         self.outcome.restarts[name] = self.outcome.restarts.get(name, 0) + 1
         LOG.warning("%s; started again in %g s", why, each.put_off())
 
-    def _close(self, each: Lives) -> int:
+    def _close(self, each: Supervised) -> int:
         code, text = each.bury()
         if text is not None:
             said = self.outcome.said.setdefault(each.member.name, [])

@@ -45,7 +45,7 @@ ENDED = (PLATFORM, SERVER, WATCHDOG, OUTPUT)
 """In this order: the command ramps down, the log is closed, and only then do the relays open."""
 
 
-class Lives:
+class Supervised:
     """A member, life after life. Raises SourceError where it cannot be heard."""
 
     def __init__(self, member: Member, folder: Path, poll: select.poll) -> None:

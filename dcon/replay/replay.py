@@ -11,7 +11,6 @@ changed settings it does not: the controller of that checkpoint had the recorded
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -63,6 +62,8 @@ class Gap:
     """From there on, that could not be replayed."""
     passed: bool = False
     """A checkpoint came, and the replay went on with it."""
+    begins: bool = False
+    """It is before all that was named, and nobody lost it."""
 
     def __str__(self) -> str:
         return (
@@ -127,32 +128,25 @@ def replay(
     name, defaults = f"{reader.path}: {_INI}", former(reader.metadata)
     settings = parse(reader.ini_text, name, tuple(changes), probe_file=reader.probe_file, defaults=defaults)
     engine = Engine(settings.params, settings.sites, verified=reader.metadata.get("verified") == "true")
-    course = _Course(engine, reader.instances, tuple(changes), observe)
-    result, later = course.result, reader.parts[0].number > 1
-    end_ns: float | None = None
+    part = reader.parts[0].number
+    begins = "" if part == 1 else f"what is read begins with part {part}"
+    course = _Course(engine, reader.instances, tuple(changes), observe, begins)
+    result, first_ns, at_end = course.result, None, True
     for group in reader.groups(_MESSAGES):
-        if end_ns is None:
-            end_ns = math.inf if duration_ns is None else group.tick_ns + duration_ns
-            if later and not group.lost:
-                group.lost = f"what is read begins with part {reader.parts[0].number}"
-        if group.tick_ns >= end_ns:
+        first_ns = group.tick_ns if first_ns is None else first_ns
+        if duration_ns is not None and group.tick_ns >= first_ns + duration_ns:
+            at_end = False
             break
         course.take(group)
-    else:
-        end_ns = None
-    if later and not result.ticks:
+    if begins and not result.ticks:
         first = reader.metadata.get("first", "")
-        raise SourceError(
-            f"{reader.path}: part {reader.parts[0].number} of a session; a replay starts with the first"
-            f"{first and f', {first}'}"
-        )
-    if later and result.gaps[0].passed and not result.gaps[0].ticks:
-        del result.gaps[0]  # nothing of what was named is missing
+        named = f", {first}" if first else ""
+        raise SourceError(f"{reader.path}: part {part} of a session; a replay starts with the first{named}")
     result.newer = newer_in(reader)
     version = reader.metadata.get("version", "")
     if result.different and not changes and version != pmutools.__version__:
         result.problems.append(f"recorded by version {version or 'unknown'}, replayed by {pmutools.__version__}")
-    result.stopped = "; ".join(_lacking(result.gaps, reader, at_end=end_ns is None))
+    result.stopped = "; ".join(_lacking(result.gaps, reader, at_end=at_end))
     if not result.ticks and not result.stopped:
         raise SourceError(f"{reader.path}: holds no tick")
     return result
@@ -174,8 +168,14 @@ class _Course:
     """A replay under way: takes the log tick by tick."""
 
     def __init__(
-        self, engine: Engine, instances: Sequence[str], changes: tuple[str, ...], observe: Observer | None
+        self,
+        engine: Engine,
+        instances: Sequence[str],
+        changes: tuple[str, ...],
+        observe: Observer | None,
+        begins: str = "",
     ) -> None:
+        """``begins`` says why ``engine`` is not that of the first tick; "" where it is."""
         self.result = Replay(changes=changes)
         self._engine = engine
         self._instances = instances
@@ -183,14 +183,16 @@ class _Course:
         self._before = "the session begins"
         self._configs: dict[str, bytes] = {}
         """Newest of each PMU."""
+        self._begins = begins
         self._gap: Gap | None = None
         """Where the engine's memory was lost; None while it is that of the controller."""
 
     def take(self, group: TickMessages) -> None:
         """Replay one tick, or count it."""
         self._configs.update(group.configs)
-        if group.lost:
-            self._lose(group, group.lost)
+        begins, self._begins = self._begins, ""
+        if lost := group.lost or begins:
+            self._lose(group, lost, begins=not group.lost)
         if self._gap is not None and not self._resumes(group, self._gap):
             self._gap.ticks += group.one("Tick") is not None
             return
@@ -202,9 +204,9 @@ class _Course:
         except ValueError as error:
             self._lose(group, str(error))
 
-    def _lose(self, group: TickMessages, why: str) -> None:
+    def _lose(self, group: TickMessages, why: str, *, begins: bool = False) -> None:
         if self._gap is None:
-            self._gap = Gap(group.tick_ns, why)
+            self._gap = Gap(group.tick_ns, why, begins=begins)
             self.result.gaps.append(self._gap)
 
     def _resumes(self, group: TickMessages, gap: Gap) -> bool:
@@ -218,6 +220,8 @@ class _Course:
         except ValueError:
             return False
         gap.passed, self._gap = True, None
+        if gap.begins and not gap.ticks:
+            self.result.gaps.remove(gap)  # nothing of what was named is missing
         self._before = "a checkpoint"
         return True
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from dcon.household import household, member, places
+from dcon.household import household, member, predecessor
 from dcon.household.household import Household, NotStarted
 from dcon.household.member import ENDED, STARTED
 from dcon.link.notify import Notifier
@@ -275,7 +275,7 @@ def test_a_second_run_in_one_folder_is_refused_at_once_and_disturbs_nobody(tmp_p
 def test_places_that_stay_taken_are_not_waited_for_without_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(places, "PLACES_S", 0.3)
+    monkeypatch.setattr(predecessor, "PLACES_S", 0.3)
     house = House(tmp_path)
     with bind_datagram(house.folder, CONTROL), pytest.raises(SourceError, match=HELD):
         house.household.run()

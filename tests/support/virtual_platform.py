@@ -12,9 +12,10 @@ from support.swing import MS, START_NS, Streams
 
 from dcon.control import loop
 from dcon.control.alone import OwnFrames
-from dcon.control.loop import Platform, Summary
+from dcon.control.loop import Platform
 from dcon.control.orders import TimedOrder, parse_order
 from dcon.control.ports import Ends
+from dcon.control.summary import Summary
 from dcon.core.values import Record
 from dcon.front.receiving import Reception
 from dcon.replay.replay import replay
