@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
-from dcon.core.values import Event, Record
+import pytest
+
+from dcon.core.differentiator import EMPTY, PAPER_60, advance
+from dcon.core.values import Event, Record, SystemState
 from dcon.engine import Engine
 from dcon.session.reader import LoggedTick, SessionReader
 from dcon.settings import parse
@@ -17,6 +21,15 @@ from pmutools.timebase import NS
 RATE = 60
 NAMES = ("N1", "N2", "N3", "N4", "S1", "S2", "S3", "S4")
 """The fleet's."""
+
+
+def ramps_down(records: Sequence[Record], k: int) -> float:
+    """Assert that the command comes from where it was down to 0 in a second, from record ``k`` on; where it was, MW."""
+    start = records[max(k - 1, 0)].command_mw
+    ramp = [record.command_mw for record in records[k : k + 61]]
+    assert ramp == pytest.approx([start * (60 - j) / 60 for j in range(61)], abs=1e-9)
+    assert records[k + 60].state is SystemState.STANDBY
+    return start
 
 
 class Logged:
@@ -64,6 +77,16 @@ class Logged:
     def own_mw(self, instance: int = 0) -> list[float]:
         """What one instance alone would have commanded, tick by tick."""
         return [record.instances[instance].command_mw for record in self.records]
+
+    def unhandled(self, name: str) -> dict[int, float]:
+        """f (Hz, deviation) of a PMU by reporting instant, as the filter alone has it that does not notice a loss."""
+        memory, found = EMPTY, dict[int, float]()
+        for tick in self.ticks:
+            for frame in tick.frames:
+                if frame.name == name:
+                    memory = advance(PAPER_60, memory, math.atan2(frame.v1.imag, frame.v1.real))
+                    found[self.slot(frame.time_ns)] = memory.f_hz
+        return found
 
     def largest_step(self) -> float:
         return max(abs(b - a) for a, b in pairwise(self.command_mw))
