@@ -8,6 +8,7 @@ from pathlib import Path
 from dcon.places import Destination, LineSource, destination, line_source
 from dcon.watchdog.codec import LOOPS
 from dcon.watchdog.limits import BOUNDS, Limits, Rules
+from pmutools.clocksources.gpsd import GPSD, Gpsd
 from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.parsers import boolean, choice, number, parsed_by, words
 from pmutools.sites import endpoint
@@ -15,7 +16,8 @@ from pmutools.sites import endpoint
 TIME_SOURCES = ("auto", "kernel", "chrony", "gpsd", "ptp", "none")
 
 
-def _listening(text: str) -> Endpoint:
+def listening(text: str) -> Endpoint:
+    """A parser: where operators are listened to, over TCP."""
     try:
         where = endpoint(text if "://" in text else f"tcp://{text}")
     except ValueError:
@@ -25,6 +27,14 @@ def _listening(text: str) -> Endpoint:
         remedy = f"write HOST:PORT, as in 127.0.0.1:{port}; an IPv6 address stands in brackets"
         raise ValueError(f"{text}: operators connect over TCP; {remedy}")
     return where
+
+
+def _gpsd(text: str) -> Gpsd:
+    try:
+        where = endpoint(f"tcp://{text}")
+    except ValueError:
+        raise ValueError(f"{text}: write HOST:PORT, as in {GPSD}; an IPv6 address stands in brackets") from None
+    return Gpsd(where.host, where.port)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +86,8 @@ class Platform:
     """Whose word on this machine's clock counts as its GPS lock: ``kernel`` (adjtimex), ``chrony``, ``gpsd``, ``ptp``,
     the best promise among them (``auto``: the lock is not known until somebody promises something), or nobody's
     (``none``: it is not known)."""
+    gpsd: Gpsd = field(default=GPSD, metadata=parsed_by(_gpsd))
+    """``HOST:PORT`` of gpsd, where it is asked."""
     time_bound_ms: float = field(default=5.0, metadata=parsed_by(number(1e-3, 1000)))
     """The clock has its lock while that word is that it is no further than this from UTC."""
 
@@ -176,7 +188,7 @@ class Server:
 
     required: bool = field(default=False, metadata=parsed_by(boolean))
     """The server must be heard: without it no arming; a loss warns."""
-    listen: Endpoint = field(default=Endpoint(Scheme.TCP, "127.0.0.1", 4790), metadata=parsed_by(_listening))
+    listen: Endpoint = field(default=Endpoint(Scheme.TCP, "127.0.0.1", 4790), metadata=parsed_by(listening))
     """``HOST:PORT`` for operators. Orders are signed, what is told is not secret to who can connect."""
     keys: str | None = field(default=None, metadata=parsed_by(str))
     """File of operators and their keys (``dcon keys``); without it nobody orders anything."""

@@ -13,7 +13,7 @@ from dcon.link.beats import LoopName
 from dcon.link.news import GpsLock
 from dcon.sections import Platform
 from pmutools.clocksources.asking import Patience
-from pmutools.clocksources.watch import HERE, ClockSources, Places
+from pmutools.clocksources.watch import ClockSources, Places
 from pmutools.measure.clockquality import ClockQuality
 from pmutools.timebase import NS
 
@@ -28,11 +28,11 @@ PATIENCE_S = 3.0
 class GpsAide(Aide):
     """The lock of this machine's clock."""
 
-    def __init__(self, platform: Platform, run_dir: Path, places: Places = HERE) -> None:
+    def __init__(self, platform: Platform, run_dir: Path, places: Places | None = None) -> None:
         super().__init__(LoopName.GPS, run_dir)
         self._source, self._limit_ns = platform.time_source, round(platform.time_bound_ms * 1e6)
         self._lock = Lock()
-        self._sources = ClockSources(places)
+        self._sources = ClockSources(places or Places(gpsd=platform.gpsd))
         self._told: tuple[Verdict | None, bool] = None, False
         self._told_ns = 0
         self._broken: Exception | None = None

@@ -50,12 +50,15 @@ def command(
     the way for closing its relays again, and arm nothing. Exit code 0: done; 1: refused, or nobody answers.
     """
     from dcon.cli import status_text
+    from dcon.sections import listening
     from dcon.server.client import Client, ask
     from pmutools.errors import SettingsError
-    from pmutools.net.endpoint import parse_endpoint
 
     talk = Talk(quiet, verbose)
-    where = parse_endpoint(to if "://" in to else f"tcp://{to}")
+    try:
+        where = listening(to)
+    except ValueError as error:
+        raise SettingsError(f"--to: {error}") from None
     show: Callable[[dict[str, Any]], str] = json.dumps if as_json else status_text.text
     if verb in LOOKS:
         if words:
@@ -106,16 +109,23 @@ def _signed(
 
 
 def _order(order: tuple[SignedOrder, bytes], where: Endpoint, talk: Talk, as_json: bool) -> int:
+    from dcon.link.orders import ESTOP
     from dcon.server.client import ask
+    from dcon.server.desk import TOLD
 
     wanted, signed = order
     answer = ask(where, {"signed": signed.decode()})
     if as_json:
         click.echo(json.dumps(answer))
+    watchdog = f"; the watchdog {answer['watchdog']}" if "watchdog" in answer else ""
     if "accepted" in answer:
         if not as_json:
-            talk.say(f"{wanted.name}: accepted; {answer.get('state')}")
+            talk.say(f"{wanted.name}: accepted; {answer.get('state')}{watchdog}")
         return Exit.DONE
     why = answer.get("refused") or answer.get("unknown") or answer.get("error")
-    talk.complain(f"dcon: {wanted.name} {'refused' if 'refused' in answer else 'not answered'}: {why}")
+    what = "refused" if "refused" in answer else "not answered"
+    if wanted.name == ESTOP and answer.get("watchdog") == TOLD:
+        talk.complain(f"dcon: estop: the watchdog {TOLD}, and opens the relays; the controller has {what}: {why}")
+        return Exit.DONE
+    talk.complain(f"dcon: {wanted.name} {what}: {why}{watchdog}")
     return Exit.FAILED

@@ -50,7 +50,7 @@ def obey(params: Params, now: Ordered, order: Order, view: ArmView, events: list
         if not why:
             return now._replace(system=moved(now.system, trigger, _by("order", who), events))
     elif (mode := mode_of(name)) is not None:
-        why = "" if now.system in MODE_IS_FREE or mode is now.mode else f"not in {now.system}: disarm first"
+        why = "" if now.system in MODE_IS_FREE or mode is now.mode else f"not possible in {now.system}: disarm first"
         if not why:
             events.append(Event(str(mode), SYSTEM, _by("order", who)))
             return now._replace(mode=mode)
@@ -78,7 +78,7 @@ def _probe_start(params: Params, now: Ordered, order: Order, events: list[Event]
     if params.probing.kind == "none":
         return "no signal: set kind in [probing]"
     if now.system is not SystemState.ACTIVE:
-        return f"not in {now.system}"
+        return f"not possible in {now.system}"
     if now.probe.is_on:
         return "a signal is under way"
     events.append(Event(order.name, SYSTEM, _by(params.probing.kind, order.who)))

@@ -173,7 +173,7 @@ PERMISSIVES: Final = (
 def refusal(params: Params, state: SystemState, trigger: Trigger, view: ArmView) -> str:
     """Why an order is refused; "" if it is not."""
     if (state, trigger) not in TRANSITIONS:
-        return f"not in {state}"
+        return f"not possible in {state}"
     if trigger is Trigger.RESET and view.causes:
         return f"still up: {' '.join(view.causes)}"
     if trigger in (Trigger.ARM, Trigger.ACTIVATE):

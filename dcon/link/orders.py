@@ -28,6 +28,7 @@ ANSWER_NS: Final = 2_000_000_000
 REFUSALS_A_SECOND = 10
 """Refused orders that become inputs; more are counted."""
 TOO_OLD: Final = "too old: is the operator's clock right?"
+ESTOP: Final = "estop"
 REPLAYED: Final = "replayed, or overtaken by a later order"
 _NS = 1_000_000_000
 
@@ -117,7 +118,15 @@ def _future(case: _Case) -> bool:
     return case.order.time_ns > case.now_ns + case.window_ns
 
 
+def _ahead(case: _Case) -> bool:
+    """It would lock its operator out until then."""
+    return case.order.sequence > case.now_ns + case.window_ns
+
+
 def _replayed(case: _Case) -> bool:
+    """An emergency stop may come again: within the window that its time is held to, and that is all."""
+    if case.order.name == ESTOP:
+        return False
     return case.order.sequence <= case.last or case.order.time_ns <= case.floor_ns
 
 
@@ -131,6 +140,7 @@ REFUSALS: Final[tuple[tuple[str, Callable[[_Case], bool]], ...]] = (
     ("the signature does not hold", _forged),
     (TOO_OLD, _old),
     ("from the future: is the operator's clock right?", _future),
+    ("its sequence is above the time and the window", _ahead),
     (REPLAYED, _replayed),
     ("not allowed to this operator", _forbidden),
 )
@@ -166,7 +176,7 @@ class Verifier:
         for reason, is_up in REFUSALS:
             if is_up(case):
                 return Refused(reason, order.who)
-        self.last[order.who] = order.sequence
+        self.last[order.who] = max(last, order.sequence)
         return order
 
 

@@ -66,10 +66,8 @@ class Gap:
     """It is before all that was named, and nobody lost it."""
 
     def __str__(self) -> str:
-        return (
-            f"the log lost something before tick {self.tick_ns} ({self.why}); "
-            f"{self.ticks} ticks from there on are not replayed"
-        )
+        lost = f"the log lost something before tick {self.tick_ns} ({self.why})"
+        return f"{lost}; {self.ticks} ticks from there on are not replayed" if self.ticks else lost
 
 
 @dataclass

@@ -21,7 +21,8 @@ from dcon.server.pending import Answer, Pending
 LOG = logging.getLogger(__name__)
 ASKS = ("status", "watch")
 VERBS = {"estop": Verb.ESTOP, "release": Verb.ESTOP_RELEASE, "reset": Verb.RESET}
-"""Orders that are the watchdog's too."""
+"""Orders that are the watchdog's too: it is told at once, whatever the controller makes of them."""
+TOLD, UNREACHED = "was told", "could not be reached"
 
 
 class Desk:
@@ -88,27 +89,27 @@ class Desk:
         if not self._verifier.operators:
             return {"refused": "this server knows no operators: set keys in [server]"}
         order = self._verifier.verify(signed, utc_ns)
-        told = ""
+        also: dict[str, Any] = {}
         if isinstance(order, SignedOrder):
             self.proven.add(asker)
-            told = self._tell_watchdog(order)
+            also = self._tell_watchdog(order)
         if self.pending.is_full(proven=isinstance(order, SignedOrder)):
-            return {"refused": f"too many orders are on their way{told}"}
+            return {"refused": "too many orders are on their way", **also}
         self.relayed += 1
         message = {"kind": "signed", "order": signed.hex(), "reply_to": self.reply_to}
         if not self._aide.send(json.dumps(message).encode()):
-            return {"refused": f"the controller cannot be reached{told}"}
-        self.pending.add(asker, signed, now_ns, told)
+            return {"refused": "the controller cannot be reached", **also}
+        self.pending.add(asker, signed, now_ns, also)
         return None
 
-    def _tell_watchdog(self, order: SignedOrder) -> str:
-        """Of what the watchdog was told, in words; "" for nothing. The controller judges the order for itself."""
+    def _tell_watchdog(self, order: SignedOrder) -> dict[str, Any]:
+        """What the answer says of that. The controller judges the order for itself."""
         if order.name not in VERBS:
-            return ""
+            return {}
         if not self._watchdog.send(encode_word(VERBS[order.name], order.who)):
-            return "; nor can the watchdog"
+            return {"watchdog": UNREACHED}
         LOG.warning("%s by %s: the watchdog was told", order.name, order.who)
-        return "; the watchdog was told"
+        return {"watchdog": TOLD}
 
 
 def _error(text: str) -> dict[str, Any]:

@@ -28,8 +28,11 @@ class _Waiting(NamedTuple):
     order: Order | None
     """None where it is no order at all: it will be refused."""
     due_ns: int
-    told: str
-    """What else was told of it, for the answer where the controller gives none."""
+    also: dict[str, Any]
+    """What its answer says besides."""
+
+    def answer(self, said: dict[str, Any]) -> Answer:
+        return Answer(self.asker, said | self.also)
 
 
 class Pending:
@@ -45,11 +48,11 @@ class Pending:
         """Half of the room is for orders whose signature holds."""
         return len(self._waiting) >= (MOST if proven else MOST // 2)
 
-    def add(self, asker: Hashable, signed: bytes, now_ns: int, told: str = "") -> None:
-        """An order was relayed; ``now_ns`` on a clock without steps."""
+    def add(self, asker: Hashable, signed: bytes, now_ns: int, also: dict[str, Any] | None = None) -> None:
+        """An order was relayed; ``now_ns`` on a clock without steps. ``also`` is in its answer, whatever that is."""
         said = read(signed)
         order = None if isinstance(said, Refused) else said.order
-        self._waiting.append(_Waiting(asker, digest(signed), order, now_ns + ANSWER_NS, told))
+        self._waiting.append(_Waiting(asker, digest(signed), order, now_ns + ANSWER_NS, also or {}))
 
     def awaits(self, asker: Hashable) -> bool:
         return any(waiting.asker == asker for waiting in self._waiting)
@@ -72,25 +75,25 @@ class Pending:
             event = next((e for e in refused if e.subject == order.name and (e.detail.endswith(by))), None)
             if event is not None:
                 refused.remove(event)
-                answers.append(Answer(waiting.asker, {"refused": event.detail.removesuffix(by)}))
+                answers.append(waiting.answer({"refused": event.detail.removesuffix(by)}))
             else:
                 told = [f"{e.name} {e.detail}".strip() for e in news.events if e.subject == SYSTEM]
                 said = {"accepted": order.name, "tick_ns": news.tick_ns, "state": news.state, "events": told}
-                answers.append(Answer(waiting.asker, said))
+                answers.append(waiting.answer(said))
         return answers
 
     def refused(self, name: str, reason: str) -> list[Answer]:
         """The answer to the order of that digest: the platform's link refuses it."""
         found = [waiting for waiting in self._waiting if waiting.digest == name]
         self._waiting = [waiting for waiting in self._waiting if waiting.digest != name]
-        return [Answer(waiting.asker, {"refused": reason}) for waiting in found]
+        return [waiting.answer({"refused": reason}) for waiting in found]
 
     def expired(self, now_ns: int) -> list[Answer]:
         """Those that the controller has not spoken of in time."""
         late = [waiting for waiting in self._waiting if now_ns >= waiting.due_ns]
         self._waiting = [waiting for waiting in self._waiting if now_ns < waiting.due_ns]
         silence = f"the controller has not answered in {ANSWER_NS // 10**9} s"
-        return [Answer(waiting.asker, {"unknown": silence + waiting.told}) for waiting in late]
+        return [waiting.answer({"unknown": silence}) for waiting in late]
 
     def forget(self, asker: Hashable) -> None:
         """Nobody waits there any more."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from pmutools.clocksources.asking import SLICE_S, NoAnswer, Patience
 from pmutools.measure.clocks import PULSE_NS, GpsClock
+from pmutools.net.endpoint import join_host
 from pmutools.timebase import NS
 
 WATCH = b'?WATCH={"enable":true,"json":true,"pps":true};\r\n'
@@ -30,6 +31,9 @@ class Gpsd(NamedTuple):
 
     host: str = "127.0.0.1"
     port: int = 2947
+
+    def __str__(self) -> str:
+        return join_host(self.host, self.port)
 
 
 GPSD = Gpsd()

@@ -128,6 +128,16 @@ def test_a_platform_alone_says_what_nobody_tells_it(
     assert err.startswith("warning: alone, nobody tells what is required (line), so nothing can be armed\n") == warns
 
 
+def test_an_operator_who_may_order_nothing_by_mistake_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(dcon(), ["keys", "Ada", "--file", "k", "--may", ""]) == 2 and not Path("k").exists()
+    assert capsys.readouterr().err == "dcon: --may: names no order; leave it out for all of them\n"
+    assert run(dcon(), ["keys", "Ada", "--file", "k", "--may", "disarm,estop"]) == 0
+    assert "may = disarm,estop" in Path("k").read_text() or "may = estop,disarm" in Path("k").read_text()
+
+
 def test_an_error_that_nobody_expected_is_one_line_too(
     session: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:

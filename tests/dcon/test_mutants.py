@@ -501,7 +501,7 @@ ARMING = [
         system.refusal,
         ((PARAMS, SystemState.STANDBY, Trigger.ARM, ARM), ""),
         ((PARAMS, SystemState.ARMED, Trigger.ACTIVATE, ARM), ""),
-        ((PARAMS, SystemState.STANDBY, Trigger.ACTIVATE, ARM), "not in STANDBY"),
+        ((PARAMS, SystemState.STANDBY, Trigger.ACTIVATE, ARM), "not possible in STANDBY"),
         ((PARAMS, SystemState.FAULT, Trigger.RESET, ARM), ""),
         ((PARAMS, SystemState.FAULT, Trigger.RESET, ARM._replace(causes=("a", "b"))), "still up: a b"),
         ((PARAMS, SystemState.ACTIVE, Trigger.DISARM, ARM._replace(ready=0, causes=("a",))), ""),

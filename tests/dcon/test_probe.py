@@ -179,7 +179,7 @@ def test_a_switch_while_probing_is_as_bumpless_as_without() -> None:
 
 def test_orders_that_are_refused() -> None:
     rig = Rig(steady(), extra=SQUARE).run(12)
-    assert Event("refused", "probe_start", "not in STANDBY") in rig.tick(Order("probe_start")).events
+    assert Event("refused", "probe_start", "not possible in STANDBY") in rig.tick(Order("probe_start")).events
     rig = probed()
     assert Event("refused", "probe_stop", "no signal is under way") in rig.tick(Order("probe_stop")).events
     rig.tick(Order("probe_start"))

@@ -157,10 +157,7 @@ def test_a_log_without_its_first_ticks_is_never_called_different(
     assert code == 3
     if checkpoints:
         assert out == f"{len(whole.ticks) - 600} ticks: identical\n"
-        assert err == (
-            f"not whole: the log lost something before tick {first} (the first 600 ticks were not logged); "
-            "0 ticks from there on are not replayed\n"
-        )
+        assert err == (f"not whole: the log lost something before tick {first} (the first 600 ticks were not logged)\n")
     else:
         assert out == "no tick could be replayed\n" and f"{len(whole.ticks) - 600} ticks from there on are not" in err
         found = json.loads(told(capsys, str(path), "--json")[1])

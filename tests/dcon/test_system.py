@@ -273,7 +273,7 @@ def test_a_release_of_the_watchdog_s_stop_is_told_and_moves_nothing() -> None:
 
 def test_a_refusal_says_whose_order_it_was() -> None:
     _, record = tick(at(S.FAULT), Order("arm", who="Ada", why="for fun"))
-    assert Event("refused", "arm", "not in FAULT; order by Ada") in record.events
+    assert Event("refused", "arm", "not possible in FAULT; order by Ada") in record.events
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ WORD = st.text(max_size=40).filter(str.isprintable)
 ORDER = st.builds(
     SignedOrder,
     st.just("Ada"),
-    st.integers(0, 2**63 - 1),
+    st.integers(0, NOW + 5 * 10**9),
     st.integers(NOW - 5 * 10**9, NOW + 5 * 10**9),
     st.sampled_from([str(name) for name in ORDERS]),
     st.floats(allow_nan=False, allow_infinity=False),
@@ -46,7 +46,8 @@ def verified(signed: bytes, **changes: object) -> SignedOrder | Refused:
 def test_what_is_signed_in_time_is_taken_exactly_and_once(given_: SignedOrder) -> None:
     judge, signed = Verifier(OPERATORS), sign(given_, KEY)
     assert judge.verify(signed, NOW) == given_ == read(signed)
-    assert judge.verify(signed, NOW) == Refused("replayed, or overtaken by a later order", "Ada")
+    again = Refused("replayed, or overtaken by a later order", "Ada")
+    assert judge.verify(signed, NOW) == (given_ if given_.name == "estop" else again)
     assert given_.order == Order(given_.name, given_.value, given_.text, "Ada", given_.why)
 
 
@@ -107,6 +108,25 @@ def doubled(signed: bytes) -> bytes:
 def test_refusals(signed: bytes, reason: str) -> None:
     found = verified(signed)
     assert isinstance(found, Refused) and found.reason == reason
+
+
+def test_no_sequence_locks_its_operator_out() -> None:
+    judge = Verifier(OPERATORS)
+    ahead = "its sequence is above the time and the window"
+    for sequence in (NOW + 5 * 10**9 + 1, 2**63 - 1):
+        assert judge.verify(sign(order(sequence=sequence), KEY), NOW) == Refused(ahead, "Ada")
+    assert isinstance(judge.verify(sign(order(sequence=NOW + 5 * 10**9), KEY), NOW), SignedOrder)
+
+
+def test_an_emergency_stop_needs_no_new_sequence_but_its_time() -> None:
+    """Whoever heard one may send it again for as long as its time counts, and stop what is stopped."""
+    judge = Verifier(OPERATORS, last={"Ada": 2**62}, floor_ns=NOW + 1)
+    stop = sign(order(name="estop"), KEY)
+    assert isinstance(judge.verify(sign(order(), KEY), NOW), Refused)
+    assert isinstance(judge.verify(stop, NOW), SignedOrder) and isinstance(judge.verify(stop, NOW), SignedOrder)
+    assert judge.last == {"Ada": 2**62}
+    assert judge.verify(stop, NOW + 5 * 10**9 + 1) == Refused("too old: is the operator's clock right?", "Ada")
+    assert judge.verify(sign(order(name="estop"), OTHER), NOW) == Refused("the signature does not hold", "Ada")
 
 
 def test_a_refused_order_does_not_use_up_a_sequence() -> None:

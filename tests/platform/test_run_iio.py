@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import random
 import signal
 import sys
 import time
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.iio import counts, iio_device, volts
-from support.running import Running, command_line, descendants
+from support.running import Running
 
 from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
@@ -22,6 +22,8 @@ pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="dcon run and IIO are Linux's"),
 ]
 ZERO = 32768
+OPENS_MS = 220
+"""After the last readback: ``readback_timeout_ms``, a round, and waking up."""
 
 
 def within(seconds: float, site: Running, low_v: float, high_v: float) -> bool:
@@ -35,6 +37,21 @@ def within(seconds: float, site: Running, low_v: float, high_v: float) -> bool:
     return False
 
 
+def strike(site: Running, number: signal.Signals) -> None:
+    """End the output, or stop it, at a random instant: the relays open in the stated time, and it comes back at 0 V."""
+    time.sleep(random.uniform(0.0, 0.3))
+    restarts, events = site.restarts(), len(site.watchdog_events())
+    at_ns = site.kill("output", number)
+    site.until(lambda now: now["state"] != "ACTIVE", "the controller saw that the output was gone")
+    opening = next(event for event in site.watchdog_events()[events:] if event["event"] in ("trip", "open"))
+    assert (opening["monotonic_ns"] - at_ns) / 1e6 - max(0.0, opening["late_ms"]) <= OPENS_MS
+    if number is signal.SIGSTOP:
+        site.kill("output")
+    site.until(lambda _: site.restarts() == restarts + 1, "the output started again")
+    assert within(5, site, 0.0, 0.001)
+    site.activate()
+
+
 def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) -> None:
     device = iio_device(tmp_path, out_voltage0_raw="1234")
     site = Running(tmp_path, device=device)
@@ -45,22 +62,16 @@ def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) 
         site.activate()
         assert within(5, site, 0.5, 10.0)
         site.caught_up()
-        restarts = site.restarts()
-        assert site.run is not None
-        (output,) = [pid for pid in descendants(site.run.pid) if "dcon.cli output" in command_line(pid)]
-        os.kill(output, signal.SIGKILL)
-        site.until(lambda now: now["state"] != "ACTIVE", "the controller saw that the output was gone")
-        site.until(lambda _: site.restarts() == restarts + 1, "the output started again")
-        assert within(5, site, 0.0, 0.001)
-        site.activate()
-        assert within(5, site, 0.5, 10.0)
-        site.caught_up()
+        for number in (signal.SIGKILL, signal.SIGSTOP):
+            strike(site, number)
+            assert within(5, site, 0.5, 10.0)
+            site.caught_up()
         assert site.end() == 130
     finally:
         site.close()
     assert counts(device) == ZERO
     assert site.gateway.commands == []
-    assert site.summary()["restarts"] == {"output": 1}
+    assert site.summary()["restarts"] == {"output": 2}
     told = [tick.surroundings.readback_v for tick in SessionReader(site.log).ticks()]
     driven = [tick.record.output_v for tick in SessionReader(site.log).ticks()]
     pairs = [(was, read) for was, read in zip(driven, told[1:], strict=False) if was and read is not None]

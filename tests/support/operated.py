@@ -46,7 +46,7 @@ class FakePlatform:
                 continue
             orders = [] if self.deaf else self._heard()
             events = [
-                Event("refused", order.name, f"not in STANDBY; order by {order.who}")
+                Event("refused", order.name, f"not possible in STANDBY; order by {order.who}")
                 if order.name == "activate"
                 else Event("done", "system", f"order by {order.who}")
                 for order in orders

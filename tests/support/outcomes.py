@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +17,8 @@ KEPT = Path(__file__).parents[2] / "docs" / "generate" / "outcomes.json"
 WRITES = "DCON_TRIALS"
 """The variable of the environment that asks for writing."""
 MEASURED = "facts"
+BOUND = re.compile(r"at most [\d.,]+ \w+")
+"""In what was measured: the bound that every run has to keep."""
 """The one part whose values differ from run to run; its names do not."""
 
 
@@ -51,7 +54,7 @@ class Outcome:
             **asdict(self),
             "events": sorted(self.events),
             "restarts": sorted(self.restarts),
-            MEASURED: [*self.facts],
+            MEASURED: {fact: BOUND.findall(measured) for fact, measured in self.facts.items()},
         }
 
 
