@@ -82,7 +82,8 @@ def add_key(path: str | os.PathLike[str], name: str, may: Collection[str] = ()) 
     be one.
     """
     if not name or not name.isprintable() or len(name) > WORDS or name != name.strip() or set(name) & set("[];#"):
-        raise SettingsError(f"{name!r} is no name of an operator: letters, digits and dots, please")
+        rule = f"1 to {WORDS} printable characters, none of them [ ] ; #"
+        raise SettingsError(f"{name!r} is no name of an operator: {rule}")
     if may:
         try:
             _may(",".join(may))

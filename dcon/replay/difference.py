@@ -48,7 +48,8 @@ class Difference:
         inputs += [
             f"order: {order.name}" + (f" {order.given:g}" if order.given is not None else "") for order in self.orders
         ]
-        what = f"tick {self.tick_ns}: {self.field} {self.recorded!r} -> {self.replayed!r}"
+        recorded, replayed = (_shortened(repr(value)) for value in (self.recorded, self.replayed))
+        what = f"tick {self.tick_ns}: {self.field} {recorded} -> {replayed}"
         return "\n  ".join((what, *(inputs if self.frames or self.orders else [*inputs, "no frames"])))
 
     def to_json(self) -> dict[str, Any]:
@@ -72,6 +73,11 @@ class Difference:
             ],
             "orders": [{"name": order.name, "value": _plain(order.given)} for order in self.orders],
         }
+
+
+def _shortened(text: str, most: int = 200) -> str:
+    """A checkpoint may be thousands of characters; ``--json`` has all of them."""
+    return text if len(text) <= most else f"{text[:most]}..."
 
 
 def _plain(value: object) -> object:
