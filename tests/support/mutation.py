@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import copy
 import inspect
+import textwrap
 from collections.abc import Callable, Iterator
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 FLIPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -78,32 +79,60 @@ def negated(node: ast.UnaryOp) -> Callable[[], None]:
     return change
 
 
-def mutants(function: FunctionType) -> Iterator[tuple[str, CodeType]]:
-    """(what is changed, code) of every mutant."""
-    source = ast.parse(inspect.getsource(function))
+def written(function: FunctionType) -> ast.Module:
+    """A function alone, without docstring, defaults and annotations; a method is one that is written further in."""
+    source = ast.parse(textwrap.dedent(inspect.getsource(function)))
     body = source.body[0]
     assert isinstance(body, ast.FunctionDef)
     if ast.get_docstring(body) is not None:
         body.body = body.body[1:]
-    body.args.defaults, body.args.kw_defaults, body.returns, body.decorator_list = [], [], None, []
-    for argument in body.args.args:
-        argument.annotation = None
-    count = len(list(places(source)))
-    for number in range(count):
+    body.args.defaults, body.args.kw_defaults = [], [None] * len(body.args.kwonlyargs)
+    body.returns, body.decorator_list = None, []
+    for node in ast.walk(source):
+        if isinstance(node, ast.arg):
+            node.annotation = None
+        elif isinstance(node, ast.AnnAssign):  # nothing looks at what a local is said to be
+            node.annotation = ast.Name("object", ast.Load())
+    return source
+
+
+def compiled(tree: ast.Module, name: str) -> CodeType:
+    """The code of the function that a tree holds."""
+    scope: dict[str, Any] = {}
+    exec(compile(ast.fix_missing_locations(tree), f"mutant of {name}", "exec"), scope)
+    code = scope[name].__code__
+    assert isinstance(code, CodeType)
+    return code
+
+
+def mutants(function: FunctionType) -> Iterator[tuple[str, CodeType]]:
+    """(what is changed, code) of every mutant."""
+    source = written(function)
+    for number in range(len(list(places(source)))):
         tree = copy.deepcopy(source)
         what, change = list(places(tree))[number]
         change()
-        ast.fix_missing_locations(tree)
-        scope: dict[str, Any] = {}
-        exec(compile(tree, f"mutant of {function.__name__}", "exec"), scope)
-        yield f"{function.__name__} {what}", scope[function.__name__].__code__
+        yield f"{function.__qualname__} {what}", compiled(tree, function.__name__)
+
+
+def functions_of(module: ModuleType) -> Iterator[FunctionType]:
+    """The functions that a module writes, and the methods of its classes."""
+    for value in vars(module).values():
+        if getattr(value, "__module__", None) == module.__name__:
+            for member in vars(value).values() if inspect.isclass(value) else (value,):
+                function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+                if isinstance(function, FunctionType) and function.__code__.co_filename == module.__file__:
+                    yield function
 
 
 def survivors(function: FunctionType, holds: Callable[[], bool]) -> list[str]:
     """Mutants that ``holds`` does not tell from ``function``; each is in its place while that is asked."""
     original, left = function.__code__, []
+    same, others = compiled(written(function), function.__name__), list(mutants(function))
     try:
-        for what, code in mutants(function):
+        function.__code__ = same
+        assert holds(), "what is not changed is told from itself: all mutants would be"
+        for what, code in others:
             function.__code__ = code
             if holds():
                 left.append(what)

@@ -14,7 +14,16 @@ from pathlib import Path
 import pytest
 from support.dogs import Dog, beating, closed, until, watchdog
 
-from dcon.link.beats import LoopName, LoopState, Verb, WatchdogState, encode_beat, encode_word
+from dcon.link.beats import (
+    LoopName,
+    LoopState,
+    Readback,
+    Verb,
+    WatchdogState,
+    encode_beat,
+    encode_readback,
+    encode_word,
+)
 from dcon.link.command import CommandOut, decode, encode
 from dcon.watchdog import loop
 from dcon.watchdog.core import step
@@ -65,6 +74,16 @@ def test_one_loop_that_hangs_is_enough(tmp_path: Path) -> None:
             dog.send(encode_beat(LoopName.OUTPUT, 1, 0))
             time.sleep(0.02)
         assert 150 < opening_ms(dog, begun_ns, "output_stuck") < 400
+
+
+@pytest.mark.realtime
+def test_readbacks_that_fall_silent_open_the_relays(tmp_path: Path) -> None:
+    with closed(tmp_path / "run", *CALM) as (dog, _):
+        dog.listen()
+        last = dog.commands[-1]
+        begun_ns = time.monotonic_ns()
+        dog.send(encode_readback(Readback(last.sequence, begun_ns, last.output_v)))
+        assert 100 < opening_ms(dog, begun_ns, "readback_silent") <= 220
 
 
 @pytest.mark.realtime
