@@ -9,21 +9,19 @@ kept. It ends when the pair does.
 from __future__ import annotations
 
 import socket
-from collections import deque
 
 from dcon.front.receiving import Reception
+from dcon.front.turns import Turns
 from dcon.link.counts import FrontCounts
 from dcon.link.crossing import Item, PmuFrameIn, encode
 from dcon.link.pulse import Pulse
 from pmutools.clock import Clock
-from pmutools.flow import Chunk
-from pmutools.net.dialogue import LinkEvent
 
 ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
 BEAT_NS = 10_000_000
-PARSE_NS = 20_000_000
-"""A turn parses for so long, and one datagram more; what is left of a round waits for the next turn."""
+PARSE_NS = 5_000_000
+"""A turn parses for so long, and one datagram more; what is left waits for the next: each port has its turn."""
 KEPT = 1000
 """News that may wait for room in the pair; the oldest go first. Of configurations the newest of each PMU waits too."""
 COUNTS_NS = 500_000_000
@@ -91,8 +89,10 @@ class Front:
         self.reception, self.outlet, self._clock = reception, outlet, clock
         self._udp, self._parse = udp, parse
         self._counted_ns = 0
-        self._received = deque[Chunk | LinkEvent]()
-        """Of the last round, what is not parsed yet."""
+        self._received = Turns()
+        """What is not parsed yet."""
+        self._dropped = 0
+        """Of it, what is counted as crowded already."""
 
     def run(self) -> None:
         while self.outlet.is_open:
@@ -100,14 +100,16 @@ class Front:
 
     def turn(self) -> None:
         reception, outlet, clock, received = self.reception, self.outlet, self._clock, self._received
-        if not received:
-            received.extend(reception.receive(ROUND_NS))
+        if received.has_room:
+            received.add(reception.receive(0 if received else ROUND_NS))
         now_ns = clock.monotonic_ns()
         self._udp.beat(now_ns)
         end_ns = now_ns + PARSE_NS
         while received and now_ns < end_ns:
-            reception.parse((received.popleft(),), outlet.add)
+            reception.parse((received.next(),), outlet.add)
             now_ns = clock.monotonic_ns()
+        reception.counts.crowded += received.dropped - self._dropped
+        self._dropped = received.dropped
         if now_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns = now_ns
             outlet.add(FrontCounts(**vars(reception.counts)))  # it also finds out whether anybody is there

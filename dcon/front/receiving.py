@@ -2,14 +2,14 @@
 
 The kernel stamps arrivals, so parsing costs no stamp its exactness. What is not of a configured source and IDCODE goes
 no further. One round takes at most 256 datagrams from each port, and of large ones fewer (``READ_DATAGRAMS`` and
-``READ_BYTES`` of :mod:`pmutools.net.udp`), so a flood of one port holds up the frames of the others by the time that
-those take.
+``READ_BYTES`` of :mod:`pmutools.net.udp`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from dcon.front.strangers import Strangers
 from dcon.link.counts import FrontCounts
 from dcon.link.crossing import Item, PmuFrameIn
 from pmutools.c37118 import FrameType, Message, StreamConfig
@@ -30,6 +30,7 @@ class Reception:
     def __init__(self, receivers: Receivers, counts: FrontCounts | None = None) -> None:
         self.receivers = receivers
         self.counts = FrontCounts() if counts is None else counts
+        self._strangers = Strangers(receivers.endpoints)
         self._unusable = 0
         """Frames that were read, and cannot be handed on, or rule nothing."""
         self._configs: dict[int, StreamConfig] = {}
@@ -49,10 +50,12 @@ class Reception:
             if not isinstance(item, Chunk):
                 counts.own_drops += item.datagrams
                 take(item)
+            elif self._strangers.drop(item):
+                continue
             for found in receivers.parse(item):
                 if isinstance(found, Message):  # what is lost the receivers count
                     self._route(found, take)
-        counts.foreign, counts.held = receivers.unwanted, receivers.held
+        counts.foreign, counts.held = receivers.unwanted + self._strangers.dropped, receivers.held
         counts.undecodable = receivers.undecodable + self._unusable
 
     def _route(self, message: Message, take: Callable[[Item], object]) -> None:

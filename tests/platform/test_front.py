@@ -6,12 +6,14 @@ import os
 import random
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -204,6 +206,49 @@ def test_a_malformed_flood_of_one_port_delays_nobody_by_more_than_a_round(rig: R
     assert any(isinstance(item, PmuFrameIn) and item.pmu == 1 for item in rig.turn())  # in the very next round
     assert time.monotonic() - began_s < 1.0
     assert rig.counts.undecodable > 100
+
+
+FLOOD = 2000
+
+
+def changing(rig: Rig, name: str) -> list[bytes]:
+    """As many configurations of a PMU, no two of them the same."""
+    config = rig.streams.configs[name]
+    (station,) = config.stations
+    return [encode_config(replace(config, stations=(replace(station, cfgcnt=1000 + k),))) for k in range(FLOOD)]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.9"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_flood_of_configurations_at_one_port_delays_nobody_else(rig: Rig, name: str, host: str) -> None:
+    """At the port of N1: its own or another IDCODE, from its address or another one."""
+    rig.configure()
+    rig.turns(2)
+    flood, is_own = changing(rig, name), (name, host) == ("N1", "127.0.0.1")
+    with rig.sender(host) as sock:
+        for datagram in flood:
+            sock.sendto(datagram, ("127.0.0.1", rig.ports[0]))
+    counts, configs, took_ns = rig.counts, 0, list[int]()
+
+    def done() -> int:
+        return configs + counts.foreign + counts.crowded + counts.own_drops
+
+    end_s = time.monotonic() + 10
+    while done() < FLOOD:
+        assert time.monotonic() < end_s, (configs, counts)
+        sent, began_ns = rig.send(1), time.thread_time_ns()
+        found = [item for item in rig.turn() if isinstance(item, PmuFrameIn)]
+        took_ns.append(time.thread_time_ns() - began_ns)
+        assert [item.frame.data for item in found if item.pmu == 1] == [sent], "in the very next turn"
+        configs += sum(item.is_config for item in found)
+    assert done() == FLOOD and (configs > 0) == is_own
+    assert is_own or counts.foreign + counts.own_drops == FLOOD
+    assert statistics.median(took_ns) < 4 * PARSE_NS
+
+    slim = encode_config(rig.streams.slim("N1"))
+    rig.sock.sendto(slim, ("127.0.0.1", rig.ports[0]))
+    sent = rig.send(0)
+    assert [frame.frame.data for frame in rig.turns(2) if frame.pmu == 0][-2:] == [slim, sent], "and then it is heard"
 
 
 LARGEST = 65_507

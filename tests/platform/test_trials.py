@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from dcon.cli import dcon
 from dcon.link.orders import SignedOrder, sign
 from dcon.server.client import Client
 from dcon.session.reader import SessionReader
+from pmutools.c37118.config import encode_config
 from pmutools.cli.shell import run
 
 pytestmark = [
@@ -63,6 +64,14 @@ def malformed_flood(site: Running) -> None:
     (frame,) = frames_now("N1", 1)
     bent = [frame[:k] + bytes([frame[k] ^ 1]) + frame[k + 1 :] for k in rng.sample(range(len(frame)), 20)]
     with flood(site.ports[0], [*bent, frame[:9], b"", rng.randbytes(1000)], 1.5):
+        pass
+
+
+def config_flood(site: Running) -> None:
+    config = Streams(("N1",)).configs["N1"]
+    (station,) = config.stations
+    changing = [encode_config(replace(config, stations=(replace(station, cfgcnt=1000 + k),))) for k in range(100)]
+    with flood(site.ports[0], changing, 1.5, source="127.0.0.2"):
         pass
 
 
@@ -155,6 +164,13 @@ TRIALS = {
     "malformed": Trial(
         "10,000 malformed datagrams/s at the port of one PMU",
         malformed_flood,
+        "ACTIVE",
+        "closed",
+        (EVERY_TICK, OTHER_HEARD),
+    ),
+    "configurations": Trial(
+        "10,000 configurations/s with a PMU's IDCODE, no two alike, from another address",
+        config_flood,
         "ACTIVE",
         "closed",
         (EVERY_TICK, OTHER_HEARD),

@@ -73,6 +73,7 @@ class Script:
         self.waiting: deque[tuple[int, Item]] = deque()
         self.closed = False
         self.unwanted = self.undecodable = self.held = 0
+        self.endpoints = ()
 
     def play(self, items: Iterable[tuple[int, Item]]) -> None:
         """Items with their arrival, in ns of unstepped UTC."""
