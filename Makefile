@@ -37,7 +37,7 @@ soak: $(VENV)/.dev
 	PYTHONPATH=tests $(BIN)/python -m bench.pacing 600
 	PYTHONPATH=tests $(BIN)/python -m bench.characterizing 600
 	PYTHONPATH=tests $(BIN)/python -m bench.running 1800
-	DCON_KILLS=50 $(BIN)/python -m pytest tests/platform/test_kills.py
+	DCON_KILLS=50 $(BIN)/python -m pytest tests/platform/test_kills.py tests/platform/test_run_iio.py
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

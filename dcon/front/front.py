@@ -89,10 +89,8 @@ class Front:
         self.reception, self.outlet, self._clock = reception, outlet, clock
         self._udp, self._parse = udp, parse
         self._counted_ns = 0
-        self._received = Turns()
+        self._received = Turns(reception.counts)
         """What is not parsed yet."""
-        self._dropped = 0
-        """Of it, what is counted as crowded already."""
 
     def run(self) -> None:
         while self.outlet.is_open:
@@ -108,8 +106,6 @@ class Front:
         while received and now_ns < end_ns:
             reception.parse((received.next(),), outlet.add)
             now_ns = clock.monotonic_ns()
-        reception.counts.crowded += received.dropped - self._dropped
-        self._dropped = received.dropped
         if now_ns - self._counted_ns >= COUNTS_NS:
             self._counted_ns = now_ns
             outlet.add(FrontCounts(**vars(reception.counts)))  # it also finds out whether anybody is there

@@ -30,7 +30,7 @@ class Reception:
     def __init__(self, receivers: Receivers, counts: FrontCounts | None = None) -> None:
         self.receivers = receivers
         self.counts = FrontCounts() if counts is None else counts
-        self._strangers = Strangers(receivers.endpoints)
+        self._strangers = Strangers(receivers.routes.hears)
         self._unusable = 0
         """Frames that were read, and cannot be handed on, or rule nothing."""
         self._configs: dict[int, StreamConfig] = {}

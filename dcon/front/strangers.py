@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable
 
 from pmutools.c37118.constants import MIN_FRAME_SIZE
-from pmutools.flow import Chunk
-from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.flow import Chunk, Flow
 
 SHOWN = 8
 """The first of each sender and IDCODE are looked at like any other, so that people are told of them."""
@@ -17,33 +16,24 @@ _SYNC = 0xAA
 
 
 class Strangers:
-    """Who may send what to which port, as far as a datagram's head can tell."""
+    """Who sends what nobody asks for. ``hears(flow, idcode)`` is whether somebody may; of None, whatever the IDCODE."""
 
-    def __init__(self, endpoints: Iterable[Endpoint]) -> None:
-        self._asked: dict[str, list[tuple[str | None, int | None]]] = {}
-        """By port: senders and IDCODEs that are asked for; None is any. Ports of commanded streams are not here."""
+    def __init__(self, hears: Callable[[Flow, int | None], bool]) -> None:
+        self._hears = hears
         self._met = Counter[tuple[str, str, int | None]]()
         self.dropped = 0
         """Datagrams that were not looked at."""
-        endpoints = tuple(endpoints)
-        commanded = {str(each.data_port or each.port) for each in endpoints if each.scheme is not Scheme.UDP}
-        for each in endpoints:
-            if each.scheme is Scheme.UDP and each.port and str(each.port) not in commanded:
-                self._asked.setdefault(str(each.port), []).append((each.source, each.idcode))
 
     def drop(self, chunk: Chunk) -> bool:
         """Whether ``chunk`` is one more of a stranger's; then it is counted."""
         flow = chunk.flow
-        port = flow.destination.rpartition(":")[2]
-        asked = None if flow.is_stream else self._asked.get(port)
-        if asked is None:
+        if flow.is_stream:
             return False
-        host = flow.host
-        here = [idcode for source, idcode in asked if source in (None, host)]
         claimed = _claimed(chunk.data)
-        if None in here or (here and (claimed is None or claimed in here)):
+        if self._hears(flow, claimed):
             return False
-        who = port, host, claimed
+        # a host that nobody asks anything of is one stranger, whatever it claims
+        who = flow.destination, flow.host, claimed if self._hears(flow, None) else None
         if len(self._met) >= MOST and who not in self._met:
             self._met.clear()
         self._met[who] += 1

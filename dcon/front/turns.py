@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Hashable, Iterable
 
+from dcon.link.counts import FrontCounts
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent
 
 MOST = 512
-"""Datagrams of one port that may wait; more are dropped. Chunks of a connection are not: with as many nothing more is
-received."""
+"""Datagrams of one port that may wait; more are dropped, and counted as crowded. Chunks of a connection are not: with
+as many nothing more is received."""
 
 
 class Turns:
     """Of each port first in, first out; of all ports, one each in turn."""
 
-    def __init__(self) -> None:
+    def __init__(self, counts: FrontCounts) -> None:
+        self._counts = counts
         self._waiting: dict[Hashable, deque[Chunk | LinkEvent]] = {}
         """By port; the one whose turn is next comes first."""
-        self.dropped = 0
-        """Datagrams that found no room."""
 
     def __bool__(self) -> bool:
         """Whether anything waits."""
@@ -35,7 +35,7 @@ class Turns:
         for item in received:
             waiting = self._waiting.setdefault(_port(item), deque())
             if len(waiting) >= MOST and isinstance(item, Chunk) and not item.flow.is_stream:
-                self.dropped += 1
+                self._counts.crowded += 1
             else:
                 waiting.append(item)
 

@@ -76,10 +76,14 @@ class Listener:
         self.noise = ""
         """What came first that is no C37.118, and from where."""
 
-    def hears(self, host: str) -> bool:
-        """Whether anything that ``host`` sends here may be asked for."""
-        subscribed = (endpoint for endpoints in self.by_idcode.values() for _, endpoint in endpoints)
-        return host in self.by_host or any(endpoint.source in (None, host) for endpoint in subscribed)
+    def hears(self, host: str, idcode: int | None = None) -> bool:
+        """Whether what ``host`` sends here, of one IDCODE or of any, may be asked for."""
+        groups = self.by_idcode.values() if idcode is None else map(self.by_idcode.get, (idcode, None))
+        sources = (endpoint.source for group in groups for _, endpoint in group or ())
+        commanded = (link.idcode for link in self.by_host.get(host, ()))
+        return any(source in (None, host) for source in sources) or any(
+            idcode is None or asked in (None, idcode) for asked in commanded
+        )
 
     def know_owners(self) -> None:
         """All that hear through it are known now."""
@@ -142,12 +146,12 @@ class Routes:
         route.dialogue.hear_misfit(now_ns)
         return True
 
-    def hears(self, flow: Flow) -> bool:
-        """Whether anything of a flow may be asked for, whatever its IDCODE."""
-        if flow in self._plumbing.links:
-            return True
+    def hears(self, flow: Flow, idcode: int | None = None) -> bool:
+        """Whether what comes of a flow, of one IDCODE or of any, may be asked for."""
+        if link := self._plumbing.links.get(flow):
+            return idcode is None or link.idcode in (None, idcode)
         listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
-        return listener is not None and listener.hears(flow.host)
+        return listener is not None and listener.hears(flow.host, idcode)
 
     def note_noise(self, chunk: Chunk) -> None:
         """A chunk came in which no frame was found, from a flow that has shown none yet, or may yet end one."""

@@ -23,6 +23,7 @@ from support.swing import Streams
 from dcon.control.linked import PairFrames, pair
 from dcon.front.front import KEPT, PARSE_NS, ROUND_NS, Front, Outlet
 from dcon.front.receiving import Reception
+from dcon.front.strangers import SHOWN
 from dcon.link.beats import LoopName
 from dcon.link.children import launch
 from dcon.link.counts import FrontCounts
@@ -212,16 +213,27 @@ FLOOD = 2000
 
 
 def changing(rig: Rig, name: str) -> list[bytes]:
-    """As many configurations of a PMU, no two of them the same."""
-    config = rig.streams.configs[name]
+    """As many configurations of a PMU, or each of an IDCODE of its own, no two of them the same."""
+    config = rig.streams.configs[name if name in NAMES else NAMES[0]]
     (station,) = config.stations
-    return [encode_config(replace(config, stations=(replace(station, cfgcnt=1000 + k),))) for k in range(FLOOD)]
+    return [
+        encode_config(
+            replace(
+                config,
+                idcode=config.idcode if name in NAMES else 20_000 + k,
+                stations=(replace(station, cfgcnt=1000 + k),),
+            )
+        )
+        for k in range(FLOOD)
+    ]
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.9"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "host"),
+    [("N1", "127.0.0.1"), ("S1", "127.0.0.1"), ("N1", "127.0.0.9"), ("S1", "127.0.0.9"), ("rotating", "127.0.0.9")],
+)
 def test_a_flood_of_configurations_at_one_port_delays_nobody_else(rig: Rig, name: str, host: str) -> None:
-    """At the port of N1: its own or another IDCODE, from its address or another one."""
+    """At the port of N1: its own, another or ever another IDCODE, from its address or another one."""
     rig.configure()
     rig.turns(2)
     flood, is_own = changing(rig, name), (name, host) == ("N1", "127.0.0.1")
@@ -243,6 +255,7 @@ def test_a_flood_of_configurations_at_one_port_delays_nobody_else(rig: Rig, name
         configs += sum(item.is_config for item in found)
     assert done() == FLOOD and (configs > 0) == is_own
     assert is_own or counts.foreign > FLOOD / 4
+    assert len(rig.receivers.routes) <= len(NAMES) + 2 * SHOWN
     assert statistics.median(took_ns) < 4 * PARSE_NS
 
     slim = encode_config(rig.streams.slim("N1"))

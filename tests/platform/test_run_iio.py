@@ -1,7 +1,11 @@
-"""``dcon run`` that drives a DAC: from frames to counts in a fake of an IIO device, and its readback into the log."""
+"""``dcon run`` that drives a DAC: from frames to counts in a fake of an IIO device, and its readback into the log.
+
+``DCON_KILLS=50`` strikes at the output as often as tests/platform/test_kills.py then does at each other process.
+"""
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import sys
@@ -15,6 +19,9 @@ from support.running import Running
 from dcon.replay.replay import replay
 from dcon.session.reader import SessionReader
 
+KILLS = int(os.environ.get("DCON_KILLS", "3"))
+SEED = int(os.environ.get("DCON_SEED", "1"))
+ROUNDS = max(1, KILLS // 10)
 pytestmark = [
     pytest.mark.alone,
     pytest.mark.slow,
@@ -37,9 +44,9 @@ def within(seconds: float, site: Running, low_v: float, high_v: float) -> bool:
     return False
 
 
-def strike(site: Running, number: signal.Signals) -> None:
+def strike(site: Running, rng: random.Random, number: signal.Signals) -> None:
     """End the output, or stop it, at a random instant: the relays open in the stated time, and it comes back at 0 V."""
-    time.sleep(random.uniform(0.0, 0.3))
+    time.sleep(rng.uniform(0.0, 0.3))
     restarts, events = site.restarts(), len(site.watchdog_events())
     at_ns = site.kill("output", number)
     site.until(lambda now: now["state"] != "ACTIVE", "the controller saw that the output was gone")
@@ -54,7 +61,7 @@ def strike(site: Running, number: signal.Signals) -> None:
 
 def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) -> None:
     device = iio_device(tmp_path, out_voltage0_raw="1234")
-    site = Running(tmp_path, device=device)
+    site, rng = Running(tmp_path, device=device), random.Random(SEED)
     try:
         site.start("--json")
         site.in_state("STANDBY")
@@ -62,8 +69,8 @@ def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) 
         site.activate()
         assert within(5, site, 0.5, 10.0)
         site.caught_up()
-        for number in (signal.SIGKILL, signal.SIGSTOP):
-            strike(site, number)
+        for number in (signal.SIGKILL, signal.SIGSTOP) * ROUNDS:
+            strike(site, rng, number)
             assert within(5, site, 0.5, 10.0)
             site.caught_up()
         assert site.end() == 130
@@ -71,7 +78,7 @@ def test_it_drives_a_dac_sees_it_read_back_and_leaves_it_at_0_v(tmp_path: Path) 
         site.close()
     assert counts(device) == ZERO
     assert site.gateway.commands == []
-    assert site.summary()["restarts"] == {"output": 2}
+    assert site.summary()["restarts"] == {"output": 2 * ROUNDS}
     told = [tick.surroundings.readback_v for tick in SessionReader(site.log).ticks()]
     driven = [tick.record.output_v for tick in SessionReader(site.log).ticks()]
     pairs = [(was, read) for was, read in zip(driven, told[1:], strict=False) if was and read is not None]
