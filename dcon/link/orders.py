@@ -27,6 +27,7 @@ ANSWER_NS: Final = 2_000_000_000
 """An order that the controller has not spoken of for so long is answered with that."""
 REFUSALS_A_SECOND = 10
 """Refused orders that become inputs; more are counted."""
+MOST_STOPS = 1000
 TOO_OLD: Final = "too old: is the operator's clock right?"
 ESTOP: Final = "estop"
 REPLAYED: Final = "replayed, or overtaken by a later order"
@@ -96,6 +97,8 @@ class _Case(NamedTuple):
     operator: Operator | None
     last: int
     """Sequence of the operator's last order."""
+    is_known: bool
+    """It is an emergency stop that was taken before."""
     floor_ns: int
     window_ns: int
     now_ns: int
@@ -124,9 +127,9 @@ def _ahead(case: _Case) -> bool:
 
 
 def _replayed(case: _Case) -> bool:
-    """An emergency stop may come again: within the window that its time is held to, and that is all."""
+    """An emergency stop needs no sequence above the last: no other order may keep one from stopping."""
     if case.order.name == ESTOP:
-        return False
+        return case.is_known
     return case.order.sequence <= case.last or case.order.time_ns <= case.floor_ns
 
 
@@ -148,7 +151,10 @@ REFUSALS: Final[tuple[tuple[str, Callable[[_Case], bool]], ...]] = (
 
 
 class Verifier:
-    """Judges signed orders, and remembers the last of each operator. Memory: a number an operator."""
+    """Judges signed orders, and remembers the last of each operator and the emergency stops that are not too old yet.
+
+    Memory: a number an operator, and the newest :data:`MOST_STOPS`.
+    """
 
     def __init__(
         self,
@@ -164,6 +170,8 @@ class Verifier:
         self.window_ns = window_ns
         self.floor_ns = floor_ns
         self.last = dict(last or {})
+        self._stops: dict[str, int] = {}
+        """``time_ns`` of those that were taken, by their MAC."""
 
     def verify(self, signed: bytes, now_ns: int) -> SignedOrder | Refused:
         """The order, whose sequence is used up by this; or why it is refused."""
@@ -172,11 +180,14 @@ class Verifier:
             return parsed
         order, mac = parsed
         operator, last = self.operators.get(order.who), self.last.get(order.who, -1)
-        case = _Case(order, mac, operator, last, self.floor_ns, self.window_ns, now_ns)
+        case = _Case(order, mac, operator, last, mac in self._stops, self.floor_ns, self.window_ns, now_ns)
         for reason, is_up in REFUSALS:
             if is_up(case):
                 return Refused(reason, order.who)
         self.last[order.who] = max(last, order.sequence)
+        if order.name == ESTOP:
+            recent = [stop for stop in self._stops.items() if stop[1] >= now_ns - self.window_ns]
+            self._stops = dict([*recent, (mac, order.time_ns)][-MOST_STOPS:])
         return order
 
 

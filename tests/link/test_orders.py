@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,20 @@ from hypothesis import strategies as st
 from dcon.core.system import LINK_REFUSED, ORDERS
 from dcon.core.values import Order
 from dcon.link.keys import add_key, load_sequences, read_keys, save_sequences
-from dcon.link.orders import LONGEST, WORDS, Operator, RefusalLog, Refused, SignedOrder, Verifier, digest, read, sign
+from dcon.link.orders import (
+    LONGEST,
+    MOST_STOPS,
+    REPLAYED,
+    WORDS,
+    Operator,
+    RefusalLog,
+    Refused,
+    SignedOrder,
+    Verifier,
+    digest,
+    read,
+    sign,
+)
 from pmutools.errors import SettingsError, SourceError
 
 NOW = 1_700_000_000_000_000_000
@@ -46,8 +60,7 @@ def verified(signed: bytes, **changes: object) -> SignedOrder | Refused:
 def test_what_is_signed_in_time_is_taken_exactly_and_once(given_: SignedOrder) -> None:
     judge, signed = Verifier(OPERATORS), sign(given_, KEY)
     assert judge.verify(signed, NOW) == given_ == read(signed)
-    again = Refused("replayed, or overtaken by a later order", "Ada")
-    assert judge.verify(signed, NOW) == (given_ if given_.name == "estop" else again)
+    assert judge.verify(signed, NOW) == Refused(REPLAYED, "Ada")
     assert given_.order == Order(given_.name, given_.value, given_.text, "Ada", given_.why)
 
 
@@ -118,15 +131,35 @@ def test_no_sequence_locks_its_operator_out() -> None:
     assert isinstance(judge.verify(sign(order(sequence=NOW + 5 * 10**9), KEY), NOW), SignedOrder)
 
 
-def test_an_emergency_stop_needs_no_new_sequence_but_its_time() -> None:
-    """Whoever heard one may send it again for as long as its time counts, and stop what is stopped."""
+def test_an_emergency_stop_needs_no_new_sequence_but_its_time_and_counts_once() -> None:
     judge = Verifier(OPERATORS, last={"Ada": 2**62}, floor_ns=NOW + 1)
-    stop = sign(order(name="estop"), KEY)
+    stop, other = (sign(order(name="estop", why=why), KEY) for why in ("smoke", "fire"))
     assert isinstance(judge.verify(sign(order(), KEY), NOW), Refused)
-    assert isinstance(judge.verify(stop, NOW), SignedOrder) and isinstance(judge.verify(stop, NOW), SignedOrder)
+    assert isinstance(judge.verify(stop, NOW), SignedOrder) and isinstance(judge.verify(other, NOW), SignedOrder)
     assert judge.last == {"Ada": 2**62}
+    assert judge.verify(stop, NOW) == judge.verify(stop, NOW + 5 * 10**9) == Refused(REPLAYED, "Ada")
     assert judge.verify(stop, NOW + 5 * 10**9 + 1) == Refused("too old: is the operator's clock right?", "Ada")
     assert judge.verify(sign(order(name="estop"), OTHER), NOW) == Refused("the signature does not hold", "Ada")
+
+
+@given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 6)), max_size=40))
+def test_whatever_comes_in_between_no_emergency_stop_counts_twice(sent: list[tuple[int, int]]) -> None:
+    """(which, seconds since the one before), each signed for a second of its own."""
+    judge, now_ns, taken = Verifier(OPERATORS), NOW, Counter[int]()
+    for which, seconds in sent:
+        now_ns += seconds * 10**9
+        stop = sign(order(name="estop", time_ns=NOW + which * 10**9), KEY)
+        found = judge.verify(stop, now_ns)
+        is_timely = abs(NOW + which * 10**9 - now_ns) <= 5 * 10**9
+        assert isinstance(found, SignedOrder) == (is_timely and not taken[which])
+        taken[which] += isinstance(found, SignedOrder)
+
+
+def test_how_many_stops_are_remembered_is_bounded() -> None:
+    judge = Verifier(OPERATORS)
+    for number in range(MOST_STOPS + 10):
+        assert isinstance(judge.verify(sign(order(name="estop", sequence=number), KEY), NOW), SignedOrder)
+    assert len(judge._stops) == MOST_STOPS
 
 
 def test_a_refused_order_does_not_use_up_a_sequence() -> None:
