@@ -14,6 +14,7 @@ from pmutools.cli.shell import visible
 
 SMALLEST = (40, 10)
 """Columns and lines that a display needs."""
+MORE_EVENTS = 8
 PLAIN = Style()
 BOLD = Style(bold=True)
 DIM = Style(dim=True)
@@ -23,6 +24,18 @@ GOOD = Style(color="green", bold=True)
 BAD = Style(color="red", bold=True)
 MARK = Style(color="magenta", bold=True)
 """Colours that can be read on dark and on light; all is said in words or signs too, as there may be none."""
+
+
+def room_between(height: int, around: int) -> int:
+    """How many rows of a table fit between ``around`` lines, with a line for events, or three on a high screen."""
+    return max(1, height - around - (1 if height < 30 else 3))
+
+
+def event_lines(events: Sequence[str], space: int) -> Iterator[Text]:
+    """``space`` lines, with the newest of ``events`` at their end."""
+    shown = events[-min(space, MORE_EVENTS) :] if space else ()
+    yield from (Text() for _ in range(space - len(shown)))
+    yield from (Text(visible(event), DIM) for event in shown)
 
 
 def help_line(labels: Sequence[str], width: int) -> Text:

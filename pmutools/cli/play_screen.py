@@ -20,10 +20,12 @@ from pmutools.cli.look import (
     MARK,
     PLAIN,
     SELECTED,
+    event_lines,
     fitted,
     help_line,
     help_page,
     prompt_line,
+    room_between,
 )
 from pmutools.cli.play_keys import KEYS, PROMPTS, Ui, chosen, seconds
 from pmutools.cli.shell import visible
@@ -34,7 +36,6 @@ HEAD = 5
 """Lines above the streams, with the header of their table."""
 FOOT = 3
 """Lines below them and the events: selected stream, message, help."""
-MORE_EVENTS = 8
 
 STATES = {PlayState.PLAYING: GOOD, PlayState.PAUSED: MARK, PlayState.WAITING: BOLD, PlayState.ENDED: BAD}
 
@@ -51,7 +52,7 @@ class Title(NamedTuple):
 
 def page_rows(height: int) -> int:
     """How many streams fit."""
-    return max(1, height - HEAD - FOOT - (1 if height < 30 else 3))
+    return room_between(height, HEAD + FOOT)
 
 
 def lines(
@@ -86,10 +87,7 @@ def _lines(
         style = SELECTED if index == selected else DIM if not stream.enabled else PLAIN
         yield Text(table.row(stream), style)
     yield _chosen(status, ui, f"{top + 1}-{top + len(page)} of {count}" if count > rows else f"{count} streams")
-    space = height - HEAD - len(page) - FOOT
-    events = ui.events[-min(space, MORE_EVENTS) :] if space else ()
-    yield from (Text() for _ in range(space - len(events)))
-    yield from (Text(visible(event), DIM) for event in events)
+    yield from event_lines(ui.events, height - HEAD - len(page) - FOOT)
     yield _message(ui, status, width)
     yield help_line([key.label for key in KEYS], width)
 

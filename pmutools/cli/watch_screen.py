@@ -22,10 +22,12 @@ from pmutools.cli.look import (
     MARK,
     PLAIN,
     SELECTED,
+    event_lines,
     fitted,
     help_line,
     help_page,
     prompt_line,
+    room_between,
 )
 from pmutools.cli.quality_text import stat_text, time_quality_text
 from pmutools.cli.shell import visible
@@ -38,13 +40,12 @@ HEAD = 4
 """Lines above the streams: title, totals, facts, header."""
 FOOT = 4
 """Lines below them and the events: two of the selected stream, message, help."""
-MORE_EVENTS = 8
 MARK_WIDTH = 2
 
 
 def page_rows(height: int) -> int:
     """How many streams fit."""
-    return max(1, height - HEAD - FOOT - (1 if height < 30 else 3))
+    return room_between(height, HEAD + FOOT)
 
 
 def listed(snapshot: Snapshot, ui: Ui) -> npt.NDArray[np.intp]:
@@ -105,10 +106,7 @@ def _lines(
     for place, number_of_row in enumerate(page.tolist(), top):
         yield _row(snapshot.row(number_of_row), table, chosen=place == selected)
     yield from _chosen(snapshot, rows, selected, ui, f"{top + 1}-{top + len(page)} of {len(rows)}")
-    space = height - HEAD - len(page) - FOOT
-    events = ui.events[-min(space, MORE_EVENTS) :] if space else ()
-    yield from (Text() for _ in range(space - len(events)))
-    yield from (Text(visible(event), DIM) for event in events)
+    yield from event_lines(ui.events, height - HEAD - len(page) - FOOT)
     yield prompt_line("filter: " if ui.typing else None, ui.filter, ui.message, width, error=ui.error)
     yield help_line([label for label, _, _ in with_commands(commands)], width)
 
