@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: matrices her
 
 from support.requires import requires as _requires
 
-pytest.register_assert_rewrite("support.logged", "support.paper_facts", "support.trial_facts")
+pytest.register_assert_rewrite("support.logged", "support.paper_facts", "support.trial_facts", "support.wire_judges")
 
 
 @pytest.fixture
