@@ -13,7 +13,6 @@ from dcon.session.parts import free_path
 from dcon.session.rolling import RollingWriter
 from dcon.settings import Settings
 from pmutools.clock import Clock
-from pmutools.net.receiver import Receivers
 
 COARSE_NS = 1_200_000
 """Selectors wait in whole milliseconds: the last stretch before a deadline is slept exactly."""
@@ -49,7 +48,7 @@ def own_ends(settings: Settings, clock: Clock, log_path: str) -> Ends:
     """
     command = Nowhere() if settings.output.url is None else UdpCommandDriver(settings.output.url)
     try:
-        receivers = Receivers([site.endpoint for site in settings.sites], clock)
+        reception = Reception.of([site.endpoint for site in settings.sites], clock)
     except BaseException:
         command.close()
         raise
@@ -58,4 +57,4 @@ def own_ends(settings: Settings, clock: Clock, log_path: str) -> Ends:
     def open_log(head: Head) -> RollingWriter:
         return RollingWriter(free_path(log_path), head, max_mb=limits.max_mb, max_minutes=limits.max_minutes)
 
-    return Ends(OwnFrames(Reception(receivers), clock), open_log, command)
+    return Ends(OwnFrames(reception, clock), open_log, command)

@@ -44,6 +44,8 @@ PAIR_BYTES = 4 << 20
 """Asked for in the pair: seconds of eight PMUs."""
 MESSAGES_A_TICK = 64
 """Of the front, before a deadline and after it; what is left waits in the pair."""
+ITEMS_A_TICK = 2048
+"""Of these messages' frames and news, and one message more."""
 LARGEST_BYTES = 1 << 18
 NEWS_A_TICK = 64
 LAST_S = 5.0
@@ -81,7 +83,10 @@ class PairFrames:
             self._early.append(item)
 
     def _drained(self) -> Iterable[Item]:
+        taken = 0
         for _ in range(MESSAGES_A_TICK):
+            if taken >= ITEMS_A_TICK:
+                return
             try:
                 message = self._sock.recv(LARGEST_BYTES)
             except OSError:
@@ -89,6 +94,7 @@ class PairFrames:
             if not message:  # the front has ended: the kernel says so to its parent too
                 return
             for item in decode(message):
+                taken += 1
                 if isinstance(item, FrontCounts):
                     self.counts = item
                 else:

@@ -16,6 +16,7 @@ import gc
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 from dcon.control.orders import OrderBook, TimedOrder
 from dcon.control.ports import Ends, Log, Told
@@ -35,7 +36,7 @@ from dcon.session.codec import Timing
 from dcon.session.encode import tick_entries
 from dcon.session.head import Head
 from dcon.settings import Settings
-from pmutools.c37118 import Frame, decode_config
+from pmutools.c37118 import Frame, StreamConfig, decode_config
 from pmutools.clock import Clock, UtcOffset, utc_offset
 from pmutools.errors import SettingsError, WireError
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -249,7 +250,7 @@ class Platform:
     def _configure(self, name: str, frame: Frame) -> None:
         engine = self.engine
         try:
-            config = decode_config(frame.data)[1]
+            config = _decoded(frame.data)
         except WireError:  # it was decoded before it was handed on
             return
         known = engine.configs.get(name)
@@ -269,6 +270,12 @@ class Platform:
         summary.final_state = str(self.engine.state.system)
         summary.session, summary.unlogged_ticks = log.session, log.unlogged_ticks
         summary.log_parts = list(map(str, log.parts))
+
+
+@lru_cache(maxsize=1)
+def _decoded(data: bytes) -> StreamConfig:
+    """PMUs of one stream have one configuration, and it takes long."""
+    return decode_config(data)[1]
 
 
 def prepare(*, fifo: bool) -> None:

@@ -11,12 +11,16 @@ LATEST_NS = NS
 """An arrival further from the tick than this is a clock's mistake: the frame is taken, the latency check is for it."""
 FRAMES_A_TICK = 16
 """Of one PMU: a flood in its name costs the tick no more than this. A PMU sends one, after a pause some more."""
+BYTES_A_TICK = 8 << 10
+"""Of one PMU, and one frame more: long frames take longer to read and to log."""
 WAITING = 512
 """Frames of one PMU that may wait; more are counted and gone. A second of 60 frames/s is made up for."""
 
 CONFIGS = 4
 CONFIGS_NS = 10 * NS
 """So many configurations of one PMU are taken in so long; the newest of those beyond waits, however it may flood."""
+CONFIG_BYTES_A_TICK = 16 << 10
+"""Of all PMUs: more wait for the next tick."""
 
 
 class Waiting:
@@ -39,10 +43,13 @@ class Waiting:
     def configs(self, now_ns: int) -> list[tuple[str, Frame]]:
         """Those to be put in force now, by PMU; ``now_ns`` is of a clock without steps."""
         ready: list[tuple[str, Frame]] = []
-        for name in list(self._configs):
+        left = CONFIG_BYTES_A_TICK
+        for name, frame in list(self._configs.items()):
             taken = self._taken.setdefault(name, deque(maxlen=CONFIGS))
-            if len(taken) < CONFIGS or now_ns - taken[0] >= CONFIGS_NS:
+            fits = not ready or len(frame.data) <= left
+            if fits and (len(taken) < CONFIGS or now_ns - taken[0] >= CONFIGS_NS):
                 taken.append(now_ns)
+                left -= len(frame.data)
                 ready.append((name, self._configs.pop(name)))
         return ready
 
@@ -59,9 +66,14 @@ class Waiting:
         for name, queue in self._queues.items():
             later: list[Frame] = []
             now: list[Frame] = []
-            while queue and len(now) < FRAMES_A_TICK:
+            left = BYTES_A_TICK
+            while queue and len(now) < FRAMES_A_TICK and left > 0:
                 frame = queue.popleft()
-                (later if tick_ns < (frame.arrival_ns or 0) <= tick_ns + LATEST_NS else now).append(frame)
+                if tick_ns < (frame.arrival_ns or 0) <= tick_ns + LATEST_NS:
+                    later.append(frame)
+                else:
+                    now.append(frame)
+                    left -= len(frame.data)
             queue.extendleft(reversed(later))
             if name in self._configs:  # not in force yet: by another they would be misread
                 self.crowded += len(now)

@@ -17,7 +17,6 @@ from dcon.link.pulse import Pulse
 from dcon.settings import load
 from pmutools.clock import SystemClock
 from pmutools.errors import PmuError
-from pmutools.net.receiver import Receivers
 from pmutools.realtime import go_realtime
 
 
@@ -33,12 +32,11 @@ def main(arguments: list[str]) -> int:
     clock = SystemClock()
     try:
         settings = load(given.ini)
-        receivers = Receivers([site.endpoint for site in settings.sites], clock)
+        reception = Reception.of([site.endpoint for site in settings.sites], clock, counts)
     except PmuError as error:
         outlet.add(Failure.of(error))
         outlet.flush()
         return 1
-    reception = Reception(receivers, counts)
     try:
         sender = Sender(given.run_dir / WATCHDOG)
         udp, parse = (Pulse(name, sender, BEAT_NS) for name in (LoopName.UDP, LoopName.PARSE))

@@ -2,26 +2,33 @@
 
 The kernel stamps arrivals, so parsing costs no stamp its exactness. What is not of a configured source and IDCODE goes
 no further. One round takes at most 256 datagrams from each port, and of large ones fewer (``READ_DATAGRAMS`` and
-``READ_BYTES`` of :mod:`pmutools.net.udp`).
+``READ_BYTES`` of :mod:`pmutools.net.udp`), and :data:`TCP_READ_BYTES` of each connection. What passes is no more than a
+tick can do with: of each PMU so many frames (:mod:`dcon.front.allowance`), and no configuration that would take long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from dcon.front.allowance import Allowance
 from dcon.front.strangers import Strangers
 from dcon.link.counts import FrontCounts
 from dcon.link.crossing import Item, PmuFrameIn
 from pmutools.c37118 import FrameType, Message, StreamConfig
 from pmutools.c37118.config import is_fragment, whole
-from pmutools.c37118.constants import MAX_FRAME_SIZE
+from pmutools.clock import Clock
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
+from pmutools.net.endpoint import Endpoint
 from pmutools.net.receiver import Receivers
 from pmutools.timebase import NS
 
 HELD_NS = NS
 """Frames that came so long before the first configuration of their PMU are too old to control by."""
+LONGEST_CONFIG = 16 << 10
+"""Bytes: some sixty stations, or a thousand channels. The tick that takes one into use takes some 6 ms longer."""
+TCP_READ_BYTES = 4 << 10
+"""Of a connection at once: some milliseconds of parsing. Who sends more waits."""
 
 
 class Reception:
@@ -31,6 +38,7 @@ class Reception:
         self.receivers = receivers
         self.counts = FrontCounts() if counts is None else counts
         self._strangers = Strangers(receivers.routes.hears)
+        self._allowance = Allowance()
         self._unusable = 0
         """Frames that were read, and cannot be handed on, or rule nothing."""
         self._configs: dict[int, StreamConfig] = {}
@@ -38,6 +46,12 @@ class Reception:
         """By PMU, from which arrival on its frames count: what was held for its first configuration may be old."""
         self._refused: set[int] = set()
         """Whose newest configuration cannot be handed on: their data would be read by an older one."""
+
+    @classmethod
+    def of(cls, endpoints: Sequence[Endpoint], clock: Clock, counts: FrontCounts | None = None) -> Reception:
+        """From sockets. Raises as :class:`Receivers` does."""
+        receivers = Receivers(endpoints, clock, longest_config=LONGEST_CONFIG, tcp_read_bytes=TCP_READ_BYTES)
+        return cls(receivers, counts)
 
     def receive(self, timeout_ns: int) -> list[Chunk | LinkEvent]:
         """What has come; waits for it at most ``timeout_ns``."""
@@ -65,10 +79,16 @@ class Reception:
             for owner in owners:
                 if owner in self._refused:
                     self._unusable += 1
+                elif not self._allowance.takes(owner, frame.arrival_ns or 0):
+                    self.counts.crowded += 1
                 elif (frame.arrival_ns or 0) < self._since_ns.get(owner, 0):
                     self.counts.unreadable_yet += 1
                 else:
                     take(PmuFrameIn(owner, frame))
+        elif config is None and frame.type.is_config and frame.idcode in self.receivers.demux.too_long:
+            self._unusable += 1
+            for owner in set(owners) - self._refused:
+                take(self._refuse(owner, message))
         elif config is None and frame.type.is_config and not is_fragment(frame.data):
             self._unusable += 1
         elif config is None or not frame.type.rules_data:
@@ -79,20 +99,20 @@ class Reception:
             for owner in fresh:
                 self._configs[owner] = config
                 self._since_ns.setdefault(owner, (frame.arrival_ns or 0) - HELD_NS)
-                take(self._handed_on(owner, message, config))
+                self._refused.discard(owner)
+                take(PmuFrameIn(owner, frame._replace(data=whole(frame.data, config)), is_config=True))
 
-    def _handed_on(self, owner: int, message: Message, config: StreamConfig) -> Item:
-        """The whole configuration; where it is longer than a frame can be, that it is refused."""
+    def _refuse(self, owner: int, message: Message) -> LinkEvent:
+        """Its configuration is too long: nothing of it is taken until another comes."""
         frame, flow, _ = message
-        data = whole(frame.data, config)
-        if len(data) > MAX_FRAME_SIZE:
-            self._refused.add(owner)
-            self._unusable += 1
-            where = f"{flow.transport}://{flow.source}"
-            why = f"its configuration takes {len(data)} bytes, which is more than the {MAX_FRAME_SIZE} of a frame"
-            return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), f"{why}; it is refused", frame.idcode, flow)
-        self._refused.discard(owner)
-        return PmuFrameIn(owner, frame._replace(data=data), is_config=True)
+        self._refused.add(owner)
+        self._configs.pop(owner, None)
+        why = (
+            f"its configuration takes more than {LONGEST_CONFIG} bytes and is refused; "
+            "have its sender, or a PDC, send fewer stations or channels"
+        )
+        where = f"{flow.transport}://{flow.source}"
+        return LinkEvent(LinkKind.NO_CONFIG, where, (owner,), why, frame.idcode, flow)
 
     def close(self) -> None:
         self.receivers.close()

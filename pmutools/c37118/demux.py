@@ -157,9 +157,14 @@ def _all_good(train: Train) -> bool:
 class Demux:
     """Feed chunks, get messages; see the module's text. Not thread-safe."""
 
-    def __init__(self, configs: Iterable[StreamConfig] = ()) -> None:
-        """``configs`` are known beforehand, for streams that may never send theirs."""
+    def __init__(self, configs: Iterable[StreamConfig] = (), *, longest_config: int = FRAGMENT_BYTES) -> None:
+        """``configs`` are known beforehand, for streams that may never send theirs.
+
+        A configuration of more than ``longest_config`` bytes is not decoded, as if it made no sense: to decode one
+        takes about a millisecond in 8 KiB.
+        """
         self.tally = Tally()
+        self._longest_config = longest_config
         self._saved = {config.idcode: config for config in configs}
         self._flows: dict[Flow, _FlowState] = {}
         self._configs: dict[_Place, dict[Flow, StreamConfig]] = {}
@@ -172,6 +177,8 @@ class Demux:
         """Data frames that wait for a configuration now."""
         self.put_on_hold: list[int] = []
         """IDCODEs of the data frames that the last :meth:`feed` has put on hold."""
+        self.too_long: list[int] = []
+        """IDCODEs of the configurations that the last :meth:`feed` found too long to be decoded."""
         self._borrowers: dict[_Place, dict[Flow, _FlowState]] = {}
         self._fragments: dict[tuple[Flow, int], tuple[int, bytearray]] = {}
         """Of each CFG-3 that is not complete: the next CONT_IDX, and what there is; the longest untouched first."""
@@ -190,6 +197,8 @@ class Demux:
             state.fresh = True
         if self.put_on_hold:
             self.put_on_hold.clear()
+        if self.too_long:
+            self.too_long.clear()
         tally = self.tally
         tally.fed += len(data)
         for item in state.framer.feed(data, arrival_ns, stamp_source, lost_before):
@@ -388,7 +397,12 @@ class Demux:
     def _configure(self, state: _FlowState, frame: Frame, kind: FrameType, out: list[Message | Loss]) -> None:
         config: StreamConfig | None = None
         with suppress(WireError):  # a good frame whose content is not: it stays a message, with no configuration
-            config = self._join(state, frame) if is_fragment(frame.data) else decode_config(frame.data)[1]
+            if is_fragment(frame.data):
+                config = self._join(state, frame)
+            elif len(frame.data) <= self._longest_config:
+                config = decode_config(frame.data)[1]
+            elif kind.rules_data:
+                self.too_long.append(frame.idcode)
         current = state.configs.get(config.idcode) if config is not None else None
         if config is not None and current is not None and abridges(config, current):
             config = current
@@ -486,7 +500,10 @@ class Demux:
         if index == FIRST_FRAGMENT:
             expected, body = FIRST_FRAGMENT, bytearray()
         last = index == LAST_FRAGMENT
-        if (index != expected and not (last and body)) or len(body) + len(part) > FRAGMENT_BYTES:
+        if index != expected and not (last and body):
+            return None
+        if len(body) + len(part) > self._longest_config:
+            self.too_long.append(prefix.idcode)
             return None
         body += part
         if not last:

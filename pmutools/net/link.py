@@ -42,6 +42,7 @@ class Plumbing:
     emit: Callable[[Chunk | LinkEvent], None]
     batches: Batches | None
     native: bool
+    tcp_read_bytes: int
     links: dict[Flow, CommandLink] = field(default_factory=dict)
     """By the flows that the links have opened; :class:`Receivers` takes them out."""
     intake: Intake | None = None
@@ -161,6 +162,7 @@ class CommandLink:
                 connection=self._connections,
                 native=self.plumbing.native,
                 hardware_stamps=self.endpoint.hardware_stamps,
+                read_bytes=self.plumbing.tcp_read_bytes,
             )
         except SourceError as error:
             self._fail(LinkKind.FAILED, str(error))

@@ -29,7 +29,7 @@ from types import TracebackType
 
 from pmutools import linux
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.demux import DataRun, Demux, Loss, Message
+from pmutools.c37118.demux import FRAGMENT_BYTES, DataRun, Demux, Loss, Message
 from pmutools.c37118.session import CFG2_FIRST, CFG3_FIRST, SAVED_CONFIG, ClientTable, Timing
 from pmutools.clock import Clock
 from pmutools.flow import Chunk, Flow
@@ -40,7 +40,7 @@ from pmutools.net.link import CommandLink, Plumbing
 from pmutools.net.reactor import READ, Reactor
 from pmutools.net.routes import Listener, Routes
 from pmutools.net.sockets import RCVBUF_BYTES, Address, allow_open_files
-from pmutools.net.tcp import TcpCounts
+from pmutools.net.tcp import READ_BYTES, TcpCounts
 from pmutools.net.udp import Batches, UdpSocket
 
 HOUSEKEEPING_NS = 1_000_000_000
@@ -58,6 +58,10 @@ class Receivers:
         Saved configurations, by their IDCODE, for streams that may never send theirs.
     want_cfg3
         Ask for CFG-3 before CFG-2.
+    longest_config
+        Configurations of more bytes are not decoded.
+    tcp_read_bytes
+        Of a connection at once.
     native
         False takes the portable path: user-space stamps, a system call a datagram.
 
@@ -78,11 +82,13 @@ class Receivers:
         want_cfg3: bool = False,
         timing: Timing | None = None,
         rcvbuf_bytes: int = RCVBUF_BYTES,
+        longest_config: int = FRAGMENT_BYTES,
+        tcp_read_bytes: int = READ_BYTES,
         native: bool = linux.NATIVE,
     ) -> None:
         saved = tuple(configs)
         self.endpoints = tuple(endpoints)
-        self.demux = Demux(saved)
+        self.demux = Demux(saved, longest_config=longest_config)
         self.unwanted = 0
         """Messages that no endpoint asked for, and what else came from addresses of which none asks for anything."""
         self.undecodable = 0
@@ -95,7 +101,9 @@ class Receivers:
         self._out: list[Chunk | LinkEvent] = []
         self._clock = clock
         self._reactor = Reactor(clock)
-        self._plumbing = Plumbing(self._reactor, self._out.append, Batches() if native else None, native)
+        self._plumbing = Plumbing(
+            self._reactor, self._out.append, Batches() if native else None, native, tcp_read_bytes
+        )
         self._listeners: dict[tuple[str, int], Listener] = {}
         self._by_local: dict[str, Listener] = {}
         self._links: list[CommandLink] = []

@@ -29,6 +29,7 @@ from pmutools.net.sockets import (
 )
 
 READ_BYTES = 256 << 10
+"""Of a connection at once."""
 QUEUE_BYTES = 256 << 10
 """Bytes that may wait for one slow client, beside the kernel's send buffer of the same size."""
 STALL_NS = 10_000_000_000
@@ -57,6 +58,7 @@ class TcpClient:
     """A connection to a server, being made (until :meth:`finish`) or made.
 
     ``connection`` numbers the connections to this server, for the flow. ``native=False`` stamps in user space.
+    ``read_bytes`` are read at once at most: with few, who sends much waits, and holds nobody up here.
     """
 
     def __init__(
@@ -67,11 +69,12 @@ class TcpClient:
         connection: int = 0,
         native: bool = linux.NATIVE,
         hardware_stamps: bool = False,
+        read_bytes: int = READ_BYTES,
     ) -> None:
         self.address = address
         self.flow = Flow("tcp", str(address), "", connection)
         self._sock = sock = socket.socket(address.family, socket.SOCK_STREAM)
-        self._buffer = memoryview(bytearray(READ_BYTES))
+        self._buffer = memoryview(bytearray(read_bytes))
         try:
             sock.setblocking(False)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.virtual_platform import FLOWS, STREAMS, Clock, Script
 
-from dcon.front.receiving import Reception
+from dcon.front.allowance import BURST, FRAMES_A_SECOND, Allowance
+from dcon.front.receiving import LONGEST_CONFIG, Reception
 from dcon.link.crossing import Item, PmuFrameIn
 from pmutools.c37118 import FrameType, StreamConfig
 from pmutools.c37118.checksum import chk
@@ -17,7 +21,7 @@ from pmutools.net.dialogue import LinkEvent, LinkKind
 from pmutools.timebase import NS
 
 
-def long_config(phasors: int = 300) -> StreamConfig:
+def long_config(phasors: int = 70) -> StreamConfig:
     """CFG-3 of N1; each of its phasors takes more than 255 bytes of it."""
     config = STREAMS.configs["N1"]
     channels = tuple(PhasorChannel(f"{number:0255d}") for number in range(phasors))
@@ -26,9 +30,9 @@ def long_config(phasors: int = 300) -> StreamConfig:
 
 
 def fragments(config: StreamConfig) -> list[bytes]:
-    """Frames of at most 50,000 bytes of it, each with CONT_IDX and CHK."""
+    """Frames of at most 5,000 bytes of it, each with CONT_IDX and CHK."""
     body = config.body[2:]
-    parts = [body[at : at + 50_000] for at in range(0, len(body), 50_000)]
+    parts = [body[at : at + 5000] for at in range(0, len(body), 5000)]
     out = []
     for number, part in enumerate(parts, 1):
         head = (config.kind.sync & 0xFFF0 | config.version).to_bytes(2, "big") + (18 + len(part)).to_bytes(2, "big")
@@ -50,25 +54,71 @@ class Rig:
 
 
 def test_a_configuration_of_several_frames_is_handed_on_as_one() -> None:
-    config = long_config(200)
+    config = long_config(50)
+    assert len(fragments(config)) == 3
     (item,) = Rig()(*fragments(config))
     assert isinstance(item, PmuFrameIn) and item.is_config and item.frame.data == encode_config(config)
 
 
-def test_one_longer_than_a_frame_is_refused_and_told_and_its_data_are_no_more_read_as_another_s() -> None:
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_long_one_is_refused_and_told_and_data_are_no_more_read_by_the_one_before(cut: bool) -> None:
     rig = Rig()
     short, data = STREAMS.configs["N1"], STREAMS.data("N1", STREAMS.stamp_ns(0))
     assert [getattr(item, "is_config", None) for item in rig(encode_config(short), data)] == [True, False]
-    (event,) = rig(*fragments(long_config()))
+    long = long_config()
+    assert len(encode_config(long)) > LONGEST_CONFIG
+    frames = fragments(long) if cut else [encode_config(long)]
+    (event,) = rig(*frames)
     assert isinstance(event, LinkEvent) and event.kind is LinkKind.NO_CONFIG and event.owners == (0,)
-    assert "bytes, which is more than the 65535 of a frame; it is refused" in event.detail
+    assert f"its configuration takes more than {LONGEST_CONFIG} bytes and is refused" in event.detail
     assert rig.reception.counts.undecodable == 1
-    assert rig(*fragments(long_config())) == [], "said once"
-    long_data = bytearray(data[:2] + long_config().frame_size.to_bytes(2, "big") + data[4:14])
-    long_data += bytes(long_config().frame_size - 16)
-    assert rig(bytes(long_data) + chk(bytes(long_data)).to_bytes(2, "big")) == []
-    assert rig.reception.counts.undecodable == 2
+    assert rig(*frames, data) == [], "said once; and whether the frame is of the one before nobody knows"
+    counts = rig.reception.counts
+    assert counts.undecodable == 3 and counts.unneeded == (2 * (len(frames) - 1))
     assert [getattr(item, "is_config", None) for item in rig(encode_config(short), data)] == [True, False]
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_any_configuration_is_handed_on_or_refused_by_its_length(cut: bool) -> None:
+    for phasors in range(1, 240):
+        config = long_config(phasors)
+        frames = fragments(config) if cut and len(fragments(config)) > 1 else [encode_config(config)]
+        found = Rig()(*frames)
+        assert [isinstance(item, PmuFrameIn) for item in found] == [len(config.body) <= LONGEST_CONFIG], phasors
+
+
+def test_a_long_cfg_1_rules_nothing_and_changes_nothing() -> None:
+    rig = Rig()
+    short, data = STREAMS.configs["N1"], STREAMS.data("N1", STREAMS.stamp_ns(0))
+    cfg1 = replace(short, stations=short.stations * 200, kind=FrameType.CFG1)
+    assert len(encode_config(cfg1)) > LONGEST_CONFIG
+    found = rig(encode_config(short), encode_config(cfg1), data)
+    assert [getattr(item, "is_config", None) for item in found] == [True, False]
+
+
+def test_a_flood_in_the_name_of_a_pmu_passes_as_far_as_a_tick_may_read_it() -> None:
+    """A second of 10,000 frames/s, between two seconds of 60."""
+    rig, found = Rig(), list[Item]()
+    data = STREAMS.data("N1", STREAMS.stamp_ns(0))
+    rig(encode_config(STREAMS.configs["N1"]))
+    seconds = [(0, 60), (1, 10_000), (2, 60)]
+    passed = []
+    for second, rate in seconds:
+        before = len(found)
+        arrivals = (second * NS + k * NS // rate for k in range(rate))
+        rig.reception.parse([Chunk(data, at, FLOWS["N1"], StampSource.KERNEL) for at in arrivals], found.append)
+        passed.append(len(found) - before)
+    assert passed == [60, pytest.approx(BURST + FRAMES_A_SECOND, abs=2), 60]
+    assert rig.reception.counts.crowded == 10_120 - sum(passed)
+
+
+@given(st.lists(st.integers(-(10**10), 10**10), max_size=300))
+def test_however_stamps_jump_a_frame_passes_after_a_second(jumps: list[int]) -> None:
+    allowance, now_ns = Allowance(), 10**18
+    for jump in jumps:
+        now_ns += jump
+        allowance.takes(0, now_ns)
+    assert allowance.takes(0, now_ns + NS) and allowance.takes(1, 0)
 
 
 def test_what_was_held_for_a_first_configuration_counts_by_a_name_of_its_own_once_it_is_old() -> None:

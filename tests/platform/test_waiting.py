@@ -5,15 +5,15 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcon.control.waiting import CONFIGS, CONFIGS_NS, FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
+from dcon.control.waiting import BYTES_A_TICK, CONFIGS, CONFIGS_NS, FRAMES_A_TICK, LATEST_NS, WAITING, Waiting
 from pmutools.c37118 import Frame
 from pmutools.flow import StampSource
 
 TICK_NS = 10**18
 
 
-def frame(arrival_ns: int | None) -> Frame:
-    return Frame(b"", arrival_ns, StampSource.KERNEL, 0)
+def frame(arrival_ns: int | None, nbytes: int = 0) -> Frame:
+    return Frame(bytes(nbytes), arrival_ns, StampSource.KERNEL, 0)
 
 
 def test_what_came_after_the_tick_waits_for_the_next() -> None:
@@ -40,6 +40,25 @@ def test_a_flood_in_the_name_of_one_pmu_is_bounded_and_counted_and_the_others_lo
     assert len(waiting) == WAITING + 1 and waiting.crowded == 10_000 - WAITING
     taken = waiting.take(TICK_NS)
     assert {name: len(frames) for name, frames in taken.items()} == {"N1": FRAMES_A_TICK, "S1": 1}
+
+
+@given(st.lists(st.integers(1, 20_000), max_size=60))
+def test_long_frames_are_taken_by_their_bytes_and_one_always_is(sizes: list[int]) -> None:
+    waiting, taken = Waiting(), list[int]()
+    for size in sizes:
+        waiting.add("N1", frame(TICK_NS, size))
+    while found := waiting.take(TICK_NS).get("N1", []):
+        assert sum(len(f.data) for f in found[:-1]) < BYTES_A_TICK and len(found) <= FRAMES_A_TICK
+        taken += [len(f.data) for f in found]
+    assert taken == sizes
+
+
+def test_long_configurations_are_taken_one_a_tick_and_short_ones_together() -> None:
+    waiting = Waiting()
+    for name, nbytes in (("N1", 15_000), ("N2", 16_400), ("S1", 500), ("S2", 500)):
+        waiting.add_config(name, frame(1, nbytes))
+    ticks = [[name for name, _ in waiting.configs(k)] for k in range(4)]
+    assert ticks == [["N1", "S1", "S2"], ["N2"], [], []]
 
 
 @given(st.lists(st.tuples(st.sampled_from("NS"), st.integers(-5, 60)), max_size=200))
