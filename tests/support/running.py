@@ -100,13 +100,14 @@ class Running:
         device: Path | None = None,
         *,
         supervisor: str = PATIENT,
+        platform: str = "",
         time_source: str = "none",
         **law: Any,
     ) -> None:
         """``extra`` goes to the end of the initialisation file, ``names`` are PMUs of the fleet.
 
-        ``device`` is a fake of an IIO device that is driven, instead of the gateway. ``supervisor`` are lines of that
-        section, ``law`` keywords of :func:`~dcon.sim.plan.ini_of`.
+        ``device`` is a fake of an IIO device that is driven, instead of the gateway. ``supervisor`` and
+        ``platform`` are lines of those sections, ``law`` keywords of :func:`~dcon.sim.plan.ini_of`.
         """
         self.folder = folder
         self.names = names
@@ -126,7 +127,7 @@ url = {f"iio://{device}?readback=0&settle_ms=0.2" if device else f"udp://127.0.0
 [platform]
 time_source = {time_source}
 gps_required = yes
-[supervisor]
+{platform}[supervisor]
 {supervisor}[watchdog]
 required = yes
 log = {self.watchdog_log}
