@@ -89,7 +89,7 @@ class Front:
         self.reception, self.outlet, self._clock = reception, outlet, clock
         self._udp, self._parse = udp, parse
         self._counted_ns = 0
-        self._received = Turns(reception.counts)
+        self._received = Turns(reception.counts, reception.receivers.routes.hears)
         """What is not parsed yet."""
 
     def run(self) -> None:

@@ -2,8 +2,9 @@
 
 The kernel stamps arrivals, so parsing costs no stamp its exactness. What is not of a configured source and IDCODE goes
 no further. One round takes at most 256 datagrams from each port, and of large ones fewer (``READ_DATAGRAMS`` and
-``READ_BYTES`` of :mod:`pmutools.net.udp`), and :data:`TCP_READ_BYTES` of each connection. What passes is no more than a
-tick can do with: of each PMU so many frames (:mod:`dcon.front.allowance`), and no configuration that would take long.
+``READ_BYTES`` of :mod:`pmutools.net.udp`), and :data:`TCP_READ_BYTES` of each connection. What is kept is bounded
+(:data:`KEPT`): of strangers nothing is. What passes is no more than a tick can do with: of each PMU so many frames
+(:mod:`dcon.front.allowance`), and no configuration that would take long.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from dcon.front.allowance import Allowance
-from dcon.front.strangers import Strangers
 from dcon.link.counts import FrontCounts
 from dcon.link.crossing import Item, PmuFrameIn
 from pmutools.c37118 import FrameType, Message, StreamConfig
 from pmutools.c37118.config import is_fragment, whole
+from pmutools.c37118.demux import Bounds
 from pmutools.clock import Clock
 from pmutools.flow import Chunk
 from pmutools.net.dialogue import LinkEvent, LinkKind
@@ -26,7 +27,16 @@ from pmutools.timebase import NS
 HELD_NS = NS
 """Frames that came so long before the first configuration of their PMU are too old to control by."""
 LONGEST_CONFIG = 16 << 10
-"""Bytes: some sixty stations, or a thousand channels. The tick that takes one into use takes some 6 ms longer."""
+"""Bytes: some sixty stations, or eight hundred channels. The tick that takes one into use takes some 6 ms longer."""
+KEPT = Bounds(
+    flows=4096,
+    held_bytes=1 << 18,
+    all_held_bytes=4 << 20,
+    longest_config=LONGEST_CONFIG,
+    all_config_bytes=4 << 20,
+    all_fragment_bytes=1 << 20,
+)
+"""Little: the collector goes over all of it now and then, and everybody waits for it."""
 TCP_READ_BYTES = 4 << 10
 """Of a connection at once: some milliseconds of parsing. Who sends more waits."""
 
@@ -37,7 +47,6 @@ class Reception:
     def __init__(self, receivers: Receivers, counts: FrontCounts | None = None) -> None:
         self.receivers = receivers
         self.counts = FrontCounts() if counts is None else counts
-        self._strangers = Strangers(receivers.routes.hears)
         self._allowance = Allowance()
         self._unusable = 0
         """Frames that were read, and cannot be handed on, or rule nothing."""
@@ -50,7 +59,7 @@ class Reception:
     @classmethod
     def of(cls, endpoints: Sequence[Endpoint], clock: Clock, counts: FrontCounts | None = None) -> Reception:
         """From sockets. Raises as :class:`Receivers` does."""
-        receivers = Receivers(endpoints, clock, longest_config=LONGEST_CONFIG, tcp_read_bytes=TCP_READ_BYTES)
+        receivers = Receivers(endpoints, clock, bounds=KEPT, only_wanted=True, tcp_read_bytes=TCP_READ_BYTES)
         return cls(receivers, counts)
 
     def receive(self, timeout_ns: int) -> list[Chunk | LinkEvent]:
@@ -64,12 +73,10 @@ class Reception:
             if not isinstance(item, Chunk):
                 counts.own_drops += item.datagrams
                 take(item)
-            elif self._strangers.drop(item):
-                continue
             for found in receivers.parse(item):
                 if isinstance(found, Message):  # what is lost the receivers count
                     self._route(found, take)
-        counts.foreign, counts.held = receivers.unwanted + self._strangers.dropped, receivers.held
+        counts.foreign, counts.held = receivers.unwanted, receivers.held
         counts.undecodable = receivers.undecodable + self._unusable
 
     def _route(self, message: Message, take: Callable[[Item], object]) -> None:

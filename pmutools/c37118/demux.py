@@ -1,11 +1,11 @@
 """Chunks of any number of flows -> messages: frames together with the configuration they are to be read by.
 
-Configurations are kept per flow and IDCODE. A data frame whose flow has shown none is matched to another flow from
-the same host (commands over TCP with data over UDP) if exactly one fits by IDCODE and size. Data that comes before
-its configuration is held, at most :data:`HELD_BYTES` a stream and :data:`ALL_HELD_BYTES` in all, and given out when a
-configuration of the right frame size comes; what is still held at the end, or overflows, becomes
-``Skipped(NO_CONFIG)``: of one stream the oldest frames, of all streams the one that has waited longest. The frames
-come with that, in order, for who keeps bytes.
+Configurations are kept per flow and IDCODE, of streams that somebody wants. A data frame whose flow has shown none is
+matched to another flow from the same host (commands over TCP with data over UDP) if exactly one fits by IDCODE and
+size. Data that comes before its configuration is held, within :class:`Bounds`, and given out when a configuration of
+the right frame size comes; what is still held at the end, or overflows, becomes ``Skipped(NO_CONFIG)``: of one stream
+the oldest frames, of all streams the one that has waited longest. The frames come with that, in order, for who keeps
+bytes.
 
 A flow that never shows a good frame is not C37.118 traffic: its bytes are counted in ``ignored``, not skipped.
 """
@@ -13,7 +13,7 @@ A flow that never shows a good frame is not C37.118 traffic: its bytes are count
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
@@ -34,16 +34,26 @@ from pmutools.c37118.prefix import decode_prefix
 from pmutools.errors import WireError
 from pmutools.flow import Chunk, Flow, Train, host_of
 
-HELD_BYTES = 4 << 20
-ALL_HELD_BYTES = 64 << 20
-FRAGMENT_BYTES = 1 << 20
-"""A CFG-3 in several frames may be so long."""
-ALL_FRAGMENT_BYTES = 16 << 20
-"""Of all that are not complete; beyond it those begun first are given up."""
 FLOWS = 1 << 16
-"""Flows remembered at once; when another comes (a flood of spoofed sources), one is ended that has long been silent."""
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 _DATA = FrameType.DATA  # looking a member up takes longer than most of what is done with it
+
+
+class Bounds(NamedTuple):
+    """What is kept at most, whatever comes."""
+
+    flows: int = FLOWS
+    """Remembered at once; when another comes (a flood of spoofed sources), one is ended that has long been silent."""
+    held_bytes: int = 4 << 20
+    """Of data frames of one stream that wait for its configuration."""
+    all_held_bytes: int = 64 << 20
+    longest_config: int = 1 << 20
+    """Bytes; a longer one, in one frame or in several, is not decoded, as if it made no sense. To decode 8 KiB takes
+    about a millisecond."""
+    all_config_bytes: int = 64 << 20
+    """Of all configurations, as they came; beyond it a flow is ended that has long been silent."""
+    all_fragment_bytes: int = 16 << 20
+    """Of CFG-3 in several frames that are not complete; beyond it those begun first are given up."""
 
 
 class Message(NamedTuple):
@@ -51,7 +61,7 @@ class Message(NamedTuple):
 
     ``config`` is the one in force for a data frame, the decoded one for a configuration frame (None if its content is
     no configuration), and for headers and commands that of their stream, where it is known. A CFG-2 that says no more
-    than the CFG-3 in force leaves that in force, and counts as it.
+    than the CFG-3 in force leaves that in force, and counts as it. Of streams that nobody wants it is None.
     """
 
     frame: Frame
@@ -97,6 +107,7 @@ class Tally:
         self.fed += frames * size
 
 
+BOUNDS = Bounds()
 _T = TypeVar("_T")
 _Place = tuple[str, int]
 """A host and an IDCODE."""
@@ -122,6 +133,8 @@ class _FlowState:
         self.host = flow.host
         self.framer = Framer(streaming=flow.is_stream)
         self.configs: dict[int, StreamConfig] = {}
+        self.config_bytes: dict[int, int] = {}
+        """Of those that it has shown itself, as they came."""
         self.fitting: dict[bytes, StreamConfig] = {}
         """The same by the first six bytes of data frames that they fit (SYNC, FRAMESIZE, IDCODE): the short way."""
         self.heads: dict[int, list[bytes]] = {}
@@ -157,14 +170,20 @@ def _all_good(train: Train) -> bool:
 class Demux:
     """Feed chunks, get messages; see the module's text. Not thread-safe."""
 
-    def __init__(self, configs: Iterable[StreamConfig] = (), *, longest_config: int = FRAGMENT_BYTES) -> None:
+    def __init__(
+        self,
+        configs: Iterable[StreamConfig] = (),
+        *,
+        bounds: Bounds = BOUNDS,
+        wants: Callable[[Flow, int], bool] = lambda flow, idcode: True,
+    ) -> None:
         """``configs`` are known beforehand, for streams that may never send theirs.
 
-        A configuration of more than ``longest_config`` bytes is not decoded, as if it made no sense: to decode one
-        takes about a millisecond in 8 KiB.
+        ``wants(flow, idcode)``: whether anything is to be kept of a stream.
         """
         self.tally = Tally()
-        self._longest_config = longest_config
+        self._bounds, self._wants = bounds, wants
+        self._config_bytes = 0
         self._saved = {config.idcode: config for config in configs}
         self._flows: dict[Flow, _FlowState] = {}
         self._configs: dict[_Place, dict[Flow, StreamConfig]] = {}
@@ -190,7 +209,7 @@ class Demux:
         data, arrival_ns, flow, stamp_source, lost_before = chunk
         state = self._flows.get(flow)
         if state is None:
-            if len(self._flows) >= FLOWS:
+            if len(self._flows) >= self._bounds.flows:
                 out += self.end(self._silent_flow())
             state = self._flows[flow] = _FlowState(flow)
         else:
@@ -276,7 +295,9 @@ class Demux:
             return False
         state = self._flows[flow]
         held = state.held[data[4] << 8 | data[5]]
-        if held.nbytes + len(data) > HELD_BYTES or self._held_bytes + len(data) > ALL_HELD_BYTES:
+        if held.nbytes + len(data) > self._bounds.held_bytes:
+            return False
+        if self._held_bytes + len(data) > self._bounds.all_held_bytes:
             return False
         offset = state.framer.offset
         places = range(0, len(data), size)
@@ -337,6 +358,7 @@ class Demux:
             self._take(state, item, out)
         for idcode in list(state.held):
             self._give_up(state, idcode, out)
+        self._config_bytes -= sum(state.config_bytes.values())
         for idcode in state.configs:
             _forget(self._configs, (state.host, idcode), state.flow)
             _forget(self._borrowers, (state.host, idcode), state.flow)
@@ -355,7 +377,9 @@ class Demux:
             for skipped in early:
                 self._lose(state, skipped, out)
         kind = item.type
-        if kind is FrameType.DATA:
+        if not self._wants(state.flow, item.idcode):
+            self._emit(Message(item, state.flow, None), kind, out)
+        elif kind is FrameType.DATA:
             config = state.configs.get(item.idcode)
             if config is None or config.frame_size != len(item.data):
                 config = self._find_config(state, item)
@@ -399,7 +423,7 @@ class Demux:
         with suppress(WireError):  # a good frame whose content is not: it stays a message, with no configuration
             if is_fragment(frame.data):
                 config = self._join(state, frame)
-            elif len(frame.data) <= self._longest_config:
+            elif len(frame.data) <= self._bounds.longest_config:
                 config = decode_config(frame.data)[1]
             elif kind.rules_data:
                 self.too_long.append(frame.idcode)
@@ -412,6 +436,9 @@ class Demux:
         place = (state.host, config.idcode)
         if current is None or current != config:
             state.configs[config.idcode] = config
+            size = len(config.body)
+            self._config_bytes += size - state.config_bytes.get(config.idcode, 0)
+            state.config_bytes[config.idcode] = size
             state.unfit(config.idcode)
             state.borrowed.discard(config.idcode)
             for other in self._borrowers.pop(place, {}).values():  # they look again
@@ -422,6 +449,8 @@ class Demux:
         self._configs.setdefault(place, {})[state.flow] = state.configs[config.idcode]
         for other in list(self._waiting.get(place, {}).values()):
             self._release(other, state.configs[config.idcode], out)
+        while self._config_bytes > self._bounds.all_config_bytes and (flow := self._silent_flow()) != state.flow:
+            out += self.end(flow)
 
     def _release(self, state: _FlowState, config: StreamConfig, out: list[Message | Loss]) -> None:
         held = state.held[config.idcode]
@@ -454,12 +483,12 @@ class Demux:
     def _hold(self, state: _FlowState, frame: Frame, out: list[Message | Loss]) -> None:
         size = len(frame.data)
         held = state.held.get(frame.idcode)
-        while held is not None and held.frames and held.nbytes + size > HELD_BYTES:
+        while held is not None and held.frames and held.nbytes + size > self._bounds.held_bytes:
             oldest = held.frames.popleft()
             held.nbytes -= len(oldest.data)
             self._now_hold(-1, -len(oldest.data))
             self._drop(state, [oldest], out)
-        while self._waiting and self._held_bytes + size > ALL_HELD_BYTES:
+        while self._waiting and self._held_bytes + size > self._bounds.all_held_bytes:
             (_, idcode), flows = next(iter(self._waiting.items()))
             self._give_up(next(iter(flows.values())), idcode, out)
         held = state.held.setdefault(frame.idcode, _Held())
@@ -502,14 +531,15 @@ class Demux:
         last = index == LAST_FRAGMENT
         if index != expected and not (last and body):
             return None
-        if len(body) + len(part) > self._longest_config:
+        if len(body) + len(part) > self._bounds.longest_config:
             self.too_long.append(prefix.idcode)
             return None
         body += part
         if not last:
             self._fragments[key] = (index + 1, body)
             self._fragment_bytes += len(body)
-            while self._fragment_bytes > ALL_FRAGMENT_BYTES or len(self._fragments) > FLOWS:
+            bounds = self._bounds
+            while self._fragment_bytes > bounds.all_fragment_bytes or len(self._fragments) > bounds.flows:
                 _, given_up = self._fragments.pop(next(iter(self._fragments)))
                 self._fragment_bytes -= len(given_up)
             return None

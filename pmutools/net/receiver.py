@@ -29,7 +29,7 @@ from types import TracebackType
 
 from pmutools import linux
 from pmutools.c37118.config import StreamConfig
-from pmutools.c37118.demux import FRAGMENT_BYTES, DataRun, Demux, Loss, Message
+from pmutools.c37118.demux import BOUNDS, Bounds, DataRun, Demux, Loss, Message
 from pmutools.c37118.session import CFG2_FIRST, CFG3_FIRST, SAVED_CONFIG, ClientTable, Timing
 from pmutools.clock import Clock
 from pmutools.flow import Chunk, Flow
@@ -58,8 +58,11 @@ class Receivers:
         Saved configurations, by their IDCODE, for streams that may never send theirs.
     want_cfg3
         Ask for CFG-3 before CFG-2.
-    longest_config
-        Configurations of more bytes are not decoded.
+    bounds
+        Of what is kept; flows and streams alike.
+    only_wanted
+        Nothing is kept of streams that nobody asks for, and no datagram is looked at that claims to be of one, for who
+        must not be held up: their bytes are in no tally.
     tcp_read_bytes
         Of a connection at once.
     native
@@ -82,13 +85,13 @@ class Receivers:
         want_cfg3: bool = False,
         timing: Timing | None = None,
         rcvbuf_bytes: int = RCVBUF_BYTES,
-        longest_config: int = FRAGMENT_BYTES,
+        bounds: Bounds = BOUNDS,
+        only_wanted: bool = False,
         tcp_read_bytes: int = READ_BYTES,
         native: bool = linux.NATIVE,
     ) -> None:
         saved = tuple(configs)
         self.endpoints = tuple(endpoints)
-        self.demux = Demux(saved, longest_config=longest_config)
         self.unwanted = 0
         """Messages that no endpoint asked for, and what else came from addresses of which none asks for anything."""
         self.undecodable = 0
@@ -107,7 +110,9 @@ class Receivers:
         self._listeners: dict[tuple[str, int], Listener] = {}
         self._by_local: dict[str, Listener] = {}
         self._links: list[CommandLink] = []
-        self.routes = Routes(self.endpoints, self._by_local, self._timing, self._plumbing)
+        self.routes = routes = Routes(self.endpoints, self._by_local, self._timing, self._plumbing, bounds.flows)
+        self._only_wanted = only_wanted
+        self.demux = Demux(saved, bounds=bounds, wants=routes.hears) if only_wanted else Demux(saved, bounds=bounds)
         try:
             self._open()
         except BaseException:
@@ -143,6 +148,9 @@ class Receivers:
             self._count(item.flow, self.demux.runs - runs, lost)
             self.routes.end(item.flow)
             return lost
+        if self._only_wanted and self.routes.turn_away(item):
+            self.unwanted += 1
+            return []
         out: list[Message | Loss] = []
         now_ns = self._clock.monotonic_ns()
         runs = self.demux.runs

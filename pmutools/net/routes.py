@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from pmutools.c37118.config import StreamConfig
+from pmutools.c37118.constants import MIN_FRAME_SIZE
 from pmutools.c37118.demux import Message
 from pmutools.c37118.session import SPONTANEOUS, ClientEvent, ClientRole, ClientState, Timing
 from pmutools.flow import Chunk, Flow
@@ -15,13 +16,14 @@ from pmutools.net.link import CommandLink, Plumbing
 from pmutools.net.notices import Notices
 from pmutools.net.udp import UdpSocket
 
-MAX_STREAMS = 1 << 16
-"""Streams (a flow and an IDCODE) known at once; more come from nowhere but a flood, and are not passed on."""
+STRANGERS = 4096
+"""Streams that nobody wants, and that were told of; when another comes they are met again as new."""
 RIVALRY_NS = 1_000_000_000
 """Two senders of one IDCODE that both go on for so long are no restart of one."""
 FORGET_NS = 1_000_000_000
 """How long no stream is looked for that could be forgotten, after hardly any was found."""
 SHOWN_BYTES = 16
+_SYNC = 0xAA
 
 
 class Route(NamedTuple):
@@ -93,10 +95,19 @@ class Listener:
 
 
 class Routes:
-    """All routes, by flow and IDCODE. ``by_local`` are listeners by the destination of their flows."""
+    """All routes, by flow and IDCODE. ``by_local`` are listeners by the destination of their flows.
+
+    ``most`` streams (a flow and an IDCODE) are known at once; more come from nowhere but a flood, and are not passed
+    on.
+    """
 
     def __init__(
-        self, endpoints: Sequence[Endpoint], by_local: dict[str, Listener], timing: Timing, plumbing: Plumbing
+        self,
+        endpoints: Sequence[Endpoint],
+        by_local: dict[str, Listener],
+        timing: Timing,
+        plumbing: Plumbing,
+        most: int,
     ) -> None:
         self.heard: set[int] = set()
         """Endpoints of which anything has come."""
@@ -104,8 +115,11 @@ class Routes:
         self._timing, self._plumbing = timing, plumbing
         self._clock = plumbing.reactor.clock
         self.notices = Notices(plumbing.emit, self._clock.monotonic_ns())
-        self._routes: dict[Flow, dict[int, Route | None]] = {}
+        self._routes: dict[Flow, dict[int, Route]] = {}
+        self._most = most
         self._count = 0
+        self._strangers: set[tuple[str, str, int | None]] = set()
+        """Who was told of: the port, the host, and what it claims."""
         self._held: set[tuple[Flow, int]] = set()
         """Streams told to be without a configuration."""
         self._forget_from_ns = 0
@@ -118,12 +132,12 @@ class Routes:
         routes = self._routes.get(flow)
         if routes is not None and idcode in routes:
             return routes[idcode]
-        if self._count >= MAX_STREAMS and not self._forget():
+        if self._count >= self._most and not self._forget():
             return None
-        self._count += 1
         route = self._new(flow, idcode)
-        self._routes.setdefault(flow, {})[idcode] = route
         if route is not None:
+            self._count += 1
+            self._routes.setdefault(flow, {})[idcode] = route
             self.heard.update(route.owners)
         return route
 
@@ -152,6 +166,20 @@ class Routes:
             return idcode is None or link.idcode in (None, idcode)
         listener = self._by_local.get(flow.destination) if flow.transport == "udp" else None
         return listener is not None and listener.hears(flow.host, idcode)
+
+    def turn_away(self, chunk: Chunk) -> bool:
+        """Whether a chunk is a datagram of which nothing is asked for, by its head; then it is told of."""
+        flow = chunk.flow
+        if flow.is_stream:
+            return False
+        idcode = claimed(chunk.data)
+        if (idcode is not None and idcode in self._routes.get(flow, ())) or self.hears(flow, idcode):
+            return False
+        if idcode is None:
+            self.note_noise(chunk)
+        elif (listener := self._by_local.get(flow.destination)) is not None:
+            self._tell_of_foreign(listener.owners, flow, idcode)
+        return True
 
     def note_noise(self, chunk: Chunk) -> None:
         """A chunk came in which no frame was found, from a flow that has shown none yet, or may yet end one."""
@@ -235,26 +263,26 @@ class Routes:
     def _forget(self) -> bool:
         """Make room where there are too many streams; whether there is some now.
 
-        Those go that nobody wants, and spontaneous ones that are silent; who still sends is met again as new.
+        Spontaneous ones go that are silent; who still sends is met again as new.
         """
         now_ns = self._clock.monotonic_ns()
         if now_ns < self._forget_from_ns:
             return False
         for flow, routes in list(self._routes.items()):
             for idcode, route in list(routes.items()):
-                if route is None or (route.link is None and route.role.state is not ClientState.STREAMING):
+                if route.link is None and route.role.state is not ClientState.STREAMING:
                     del routes[idcode]
                     self._drop(flow, idcode, route)
             if not routes:
                 del self._routes[flow]
-        if self._count > MAX_STREAMS - MAX_STREAMS // 16:  # in vain: not to be done for each stream of a flood
+        if self._count > self._most - self._most // 16:  # in vain: not to be done for each stream of a flood
             self._forget_from_ns = now_ns + FORGET_NS
-        return self._count < MAX_STREAMS
+        return self._count < self._most
 
-    def _drop(self, flow: Flow, idcode: int, route: Route | None) -> None:
+    def _drop(self, flow: Flow, idcode: int, route: Route) -> None:
         self._count -= 1
         self._held.discard((flow, idcode))
-        if route is not None and route.link is None:
+        if route.link is None:
             route.dialogue.close()
             listener = self._by_local.get(flow.destination)
             if listener is not None and listener.senders.get(idcode) == flow:
@@ -263,6 +291,13 @@ class Routes:
     # --- telling
 
     def _tell_of_foreign(self, owners: tuple[int, ...], flow: Flow, idcode: int) -> None:
+        # a host that nobody asks anything of is one stranger, whatever it claims
+        who = flow.destination, flow.host, idcode if self.hears(flow) else None
+        if who in self._strangers:
+            return
+        if len(self._strangers) >= STRANGERS:
+            self._strangers.clear()
+        self._strangers.add(who)
         asked = ", ".join(sorted({str(self._endpoints[index]) for index in owners[:3]}))
         detail = f"IDCODE {idcode} comes from {flow.source}; asked for: {asked}{', ...' if len(owners) > 3 else ''}"
         where = f"{flow.transport}://{flow.source}"
@@ -270,11 +305,16 @@ class Routes:
 
     def _tell_of_rivals(self, listener: Listener, idcode: int, rivals: Rivals) -> None:
         route = self._routes[rivals.second][idcode]
-        assert route is not None
         one, other = rivals.first.source, rivals.second.source
         detail = f"IDCODE {idcode} comes from {one} and from {other}; take one out, or name the right one by ?source="
         where = f"udp://{rivals.second.destination}"
         self.notices.tell(LinkEvent(LinkKind.DUPLICATE, where, route.owners, detail, idcode, rivals.second))
+
+
+def claimed(data: bytes) -> int | None:
+    """The IDCODE of what claims to be one whole frame."""
+    is_frame = len(data) >= MIN_FRAME_SIZE and data[0] == _SYNC and data[2] << 8 | data[3] == len(data)
+    return data[4] << 8 | data[5] if is_frame else None
 
 
 def _beginning(data: bytes) -> str:

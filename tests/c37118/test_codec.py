@@ -28,7 +28,6 @@ from pmutools.c37118 import (
     encode_message,
     restamp,
 )
-from pmutools.c37118 import demux as demux_module
 from pmutools.c37118.batch import decode_batch, encode_batch
 from pmutools.c37118.checksum import _plain_chk, chk
 from pmutools.c37118.config import (
@@ -41,6 +40,7 @@ from pmutools.c37118.config import (
     StreamConfig,
 )
 from pmutools.c37118.constants import Format
+from pmutools.c37118.demux import Bounds
 from pmutools.c37118.framer import Frame, SkipReason
 from pmutools.c37118.frames import wire_values
 from pmutools.c37118.layout import layout_of
@@ -335,10 +335,9 @@ def test_unrelated_flows_are_ignored_not_skipped() -> None:
     assert (demux.tally.ignored, demux.tally.ignored_flows, demux.tally.skipped) == (27, 1, {})
 
 
-def test_flows_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demux_module, "FLOWS", 50)
+def test_flows_that_come_and_go_leave_nothing_behind() -> None:
     streams = [random_stream(random.Random(k), stations=1, idcode=k) for k in range(1, 9)]
-    demux = Demux()
+    demux = Demux(bounds=Bounds(flows=50))
     for number in range(3000):
         stream, other = streams[number % 8], streams[(number + 1) % 8]
         host = f"10.0.{number >> 8}.{number & 255}"
@@ -351,12 +350,11 @@ def test_flows_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyP
     assert demux.tally.fed == demux.tally.framed + demux.tally.skipped_bytes
 
 
-def test_all_flows_share_one_budget_of_held_data(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_flows_share_one_budget_of_held_data() -> None:
     stream = random_stream(random.Random(7), stations=1)
     size = len(stream.data[0])
-    monkeypatch.setattr(demux_module, "ALL_HELD_BYTES", 2000 * size)
     flows = [Flow("udp", f"10.1.{k >> 8}.{k & 255}:4713", "b:1") for k in range(3000)]
-    demux = Demux()
+    demux = Demux(bounds=Bounds(all_held_bytes=2000 * size))
     losses: list[Any] = []
     for flow in flows:
         losses += feed(demux, flow, stream.data[0])

@@ -12,7 +12,7 @@ from pmutools.c37118 import Demux, FrameType, Message, StreamConfig, decode_conf
 from pmutools.c37118.checksum import chk
 from pmutools.c37118.config import PhasorChannel, frames_in
 from pmutools.c37118.constants import PREFIX_SIZE
-from pmutools.c37118.demux import ALL_FRAGMENT_BYTES
+from pmutools.c37118.demux import BOUNDS
 from pmutools.c37118.session import Served, served
 from pmutools.errors import EncodeError, WireError
 from pmutools.flow import Chunk, Flow, StampSource
@@ -103,8 +103,12 @@ def test_fragments_that_never_end_take_so_much_memory_and_no_more() -> None:
         flow = Flow("udp", f"192.0.2.9:{5000 + port}", "192.0.2.2:4713")
         for part in many:
             demux.feed(Chunk(part, 1, flow, StampSource.KERNEL))
-        assert demux._fragment_bytes == sum(len(body) for _, body in demux._fragments.values()) <= ALL_FRAGMENT_BYTES
-    assert demux._fragment_bytes > ALL_FRAGMENT_BYTES / 2
+        assert (
+            demux._fragment_bytes
+            == sum(len(body) for _, body in demux._fragments.values())
+            <= BOUNDS.all_fragment_bytes
+        )
+    assert demux._fragment_bytes > BOUNDS.all_fragment_bytes / 2
     found = [item for part in wanted for item in demux.feed(Chunk(part, 1, FLOW, StampSource.KERNEL))]
     assert isinstance(found[-1], Message) and found[-1].config == long_config()
 

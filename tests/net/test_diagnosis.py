@@ -6,15 +6,19 @@ import random
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from support.live import CLOCK, Ear, data_frame, free_udp_port, stream
 
-from pmutools.c37118 import StreamConfig, demux, encode_config
+from pmutools.c37118 import StreamConfig, encode_config
+from pmutools.c37118.config import PhasorChannel
+from pmutools.c37118.demux import Bounds, Demux, Message
 from pmutools.c37118.session import Timing
 from pmutools.clock import VirtualClock
 from pmutools.flow import Chunk, Flow, StampSource
-from pmutools.net import notices, receiver, routes
+from pmutools.net import notices, receiver
 from pmutools.net.dialogue import LinkEvent, LinkKind, silence
 from pmutools.net.endpoint import parse_endpoint
 from pmutools.net.notices import Notices
@@ -28,11 +32,11 @@ MS = 1_000_000
 class Bench:
     """Receivers in virtual time, fed with chunks from whoever a test likes."""
 
-    def __init__(self, *queries: str) -> None:
+    def __init__(self, *queries: str, **options: Any) -> None:
         port = free_udp_port()
         self.clock = VirtualClock(monotonic_ns=10**15)
         endpoints = [parse_endpoint(f"udp://127.0.0.1:{port}{query}") for query in queries]
-        self.receivers = Receivers(endpoints, self.clock)
+        self.receivers = Receivers(endpoints, self.clock, **options)
         self.local = f"127.0.0.1:{port}"
         self.news: list[LinkEvent] = []
         self.frames: list[bytes] = []
@@ -54,8 +58,8 @@ class Bench:
 
 
 @contextmanager
-def bench(*queries: str) -> Iterator[Bench]:
-    found = Bench(*queries or ("",))
+def bench(*queries: str, **options: Any) -> Iterator[Bench]:
+    found = Bench(*queries or ("",), **options)
     try:
         yield found
     finally:
@@ -191,12 +195,11 @@ def test_a_multicast_stream_s_silence_says_so(monkeypatch: pytest.MonkeyPatch) -
 # --- floods
 
 
-def test_a_flood_of_senders_is_told_in_a_few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("only_wanted", [True, False])
+def test_a_flood_of_senders_is_told_in_a_few_lines(only_wanted: bool) -> None:
     """Each with frames that are good, each from an address of its own; one PMU sends on, and is heard throughout."""
-    monkeypatch.setattr(routes, "MAX_STREAMS", 1000)
-    monkeypatch.setattr(demux, "FLOWS", 1000)
     config, spoofed = stream(7), encode_config(stream(9))
-    with bench("?idcode=7") as found:
+    with bench("?idcode=7", bounds=Bounds(flows=1000), only_wanted=only_wanted) as found:
         found.send("10.9.9.9:4713", encode_config(config))
         for number in range(4000):
             found.send(f"10.{number >> 8}.{number & 255}.1:4713", spoofed)
@@ -209,16 +212,15 @@ def test_a_flood_of_senders_is_told_in_a_few_lines(monkeypatch: pytest.MonkeyPat
         assert len(summary) == 1
         assert f"{4000 - notices.TOLD} more of this kind" in summary[0].detail
         assert found.receivers.unwanted == 4000
-        assert len(found.receivers.routes) <= 1000
-        assert len(found.receivers.demux._flows) <= 1000
+        assert len(found.receivers.routes) == 1
+        assert len(found.receivers.demux._flows) <= (1 if only_wanted else 1000)
         assert values_of(found) == 40
         assert found.receivers.demux.tally.skipped_bytes == 0, "what is heard is not forgotten"
 
 
-def test_a_flood_of_senders_that_are_wanted_is_forgotten_when_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flood_of_senders_that_are_wanted_is_forgotten_when_silent() -> None:
     """The endpoint takes any IDCODE; the flood leaves room for a PMU that comes later."""
-    monkeypatch.setattr(routes, "MAX_STREAMS", 500)
-    with bench() as found:
+    with bench(bounds=Bounds(flows=500)) as found:
         for number in range(3000):
             found.send(f"10.{number >> 8}.{number & 255}.1:4713", *frames(stream(9)))
         found.wait(NS)
@@ -230,10 +232,39 @@ def test_a_flood_of_senders_that_are_wanted_is_forgotten_when_silent(monkeypatch
         assert values_of(found) == 3
 
 
-def test_a_flood_of_garbage_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demux, "FLOWS", 1000)
+def test_long_configurations_of_ever_more_flows_push_out_those_that_are_silent_and_nobody_who_sends_on() -> None:
+    """All in the name of one IDCODE that is asked for; what is kept of them is bounded."""
+    config = stream(7)
+    (station,) = config.stations
+    more = tuple(PhasorChannel(f"P{k}", 0) for k in range(500))
+    long = encode_config(replace(config, stations=(replace(station, phasors=station.phasors + more),)))
+    with bench("?idcode=7", bounds=Bounds(all_config_bytes=50 * len(long)), only_wanted=True) as found:
+        found.send("10.9.9.9:4713", encode_config(config))
+        for number in range(1000):
+            found.send(f"10.{number >> 8}.{number & 255}.1:4713", long)
+            if number % 10 == 0:
+                found.send("10.9.9.9:4713", *frames(config, first=number))
+            assert found.receivers.demux._config_bytes <= 51 * len(long)
+        assert values_of(found) == 100
+        assert len(found.receivers.demux._flows) <= 51
+
+
+def test_of_streams_that_nobody_wants_nothing_is_kept_over_a_connection_either() -> None:
+    wanted, other = stream(7), stream(9)
+    demux = Demux(wants=lambda flow, idcode: idcode == 7)
+    flow = Flow("tcp", "10.0.0.1:4712", "127.0.0.1:5000")
+    data = b"".join(
+        (*frames(other, 3), encode_config(other), *frames(other, 3), encode_config(wanted), *frames(wanted))
+    )
+    found = [part for part in demux.feed(Chunk(data, 1, flow, StampSource.KERNEL)) if isinstance(part, Message)]
+    assert [(part.frame.idcode, part.config is not None) for part in found] == [*[(9, False)] * 7, *[(7, True)] * 2]
+    assert demux.held_frames == 0 and list(demux._flows[flow].configs) == [7]
+    assert demux.tally.fed == demux.tally.framed
+
+
+def test_a_flood_of_garbage_is_told_once() -> None:
     rng = random.Random(1)
-    with bench() as found:
+    with bench(bounds=Bounds(flows=1000)) as found:
         for number in range(5000):
             found.send(f"10.{number >> 8}.{number & 255}.1:4713", rng.randbytes(rng.randrange(40)))
         found.wait(NS)

@@ -23,7 +23,6 @@ from support.swing import Streams
 from dcon.control.linked import ITEMS_A_TICK, PairFrames, pair
 from dcon.front.front import KEPT, PARSE_NS, ROUND_NS, Front, Outlet
 from dcon.front.receiving import Reception
-from dcon.front.strangers import SHOWN
 from dcon.link.beats import LoopName
 from dcon.link.children import launch
 from dcon.link.counts import FrontCounts
@@ -51,8 +50,8 @@ SMALL_BYTES = 1 << 17
 class Rig:
     """A front in this process, with both ends of its pair; PMU N1 from 127.0.0.1 only, or over TCP."""
 
-    def __init__(self, folder: Path, tcp_port: int | None = None) -> None:
-        self.ports = [free_udp_port() for _ in NAMES]
+    def __init__(self, folder: Path, tcp_port: int | None = None, *, is_shared: bool = False) -> None:
+        self.ports = [free_udp_port()] * len(NAMES) if is_shared else [free_udp_port() for _ in NAMES]
         self.streams = Streams(NAMES)
         urls = [f"udp://127.0.0.1:{port}?source=127.0.0.1" for port in self.ports]
         if tcp_port is not None:
@@ -259,13 +258,36 @@ def test_a_flood_of_configurations_at_one_port_delays_nobody_else(rig: Rig, name
         configs += sum(item.is_config for item in found)
     assert done() == FLOOD and (configs > 0) == is_own
     assert is_own or counts.foreign > FLOOD / 4
-    assert len(rig.receivers.routes) <= len(NAMES) + 2 * SHOWN
+    known = len(NAMES) + is_own  # that one has another port
+    assert len(rig.receivers.routes) <= known and len(rig.receivers.demux._flows) <= known
     assert statistics.median(took_ns) < 4 * PARSE_NS
 
     slim = encode_config(rig.streams.slim("N1"))
     rig.sock.sendto(slim, ("127.0.0.1", rig.ports[0]))
     sent = rig.send(0)
     assert [frame.frame.data for frame in rig.turns(2) if frame.pmu == 0][-2:] == [slim, sent], "and then it is heard"
+
+
+@pytest.mark.parametrize("kind", ["configurations", "frames", "junk"])
+def test_pmus_at_one_port_have_turns_of_their_own(tmp_path: Path, kind: str) -> None:
+    """Each turn finds sixty more datagrams in the name of N1, and one frame of S1 behind them."""
+    rig = Rig(tmp_path, is_shared=True)
+    rig.configure()
+    rig.turns(2)
+    rng = random.Random(1)
+    flood = {
+        "configurations": changing(rig, "N1"),
+        "frames": [rig.streams.data("N1", time.time_ns())] * FLOOD,
+        "junk": [rng.randbytes(100) for _ in range(FLOOD)],
+    }[kind]
+    while flood:
+        now, flood = flood[:60], flood[60:]
+        for datagram in now:
+            rig.sock.sendto(datagram, ("127.0.0.1", rig.ports[0]))
+        sent = rig.send(1)
+        found = [item for item in rig.turn() if isinstance(item, PmuFrameIn) and item.pmu == 1]
+        assert [item.frame.data for item in found] == [sent], "in the very next turn"
+    rig.close()
 
 
 LARGEST = 65_507

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from support.swing import MS, START_NS, Streams
@@ -18,7 +17,7 @@ from dcon.control.orders import TimedOrder, parse_order
 from dcon.control.ports import Ends
 from dcon.control.summary import Summary
 from dcon.core.values import Record
-from dcon.front.receiving import LONGEST_CONFIG, Reception
+from dcon.front.receiving import KEPT, Reception
 from dcon.replay.replay import replay
 from dcon.session.head import Head
 from dcon.session.reader import SessionReader
@@ -70,8 +69,7 @@ class Script:
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
-        self.demux = Demux(longest_config=LONGEST_CONFIG)
-        self.routes = SimpleNamespace(hears=lambda flow, idcode: True)
+        self.demux = Demux(bounds=KEPT)
         self.waiting: deque[tuple[int, Item]] = deque()
         self.closed = False
         self.unwanted = self.undecodable = self.held = 0

@@ -10,8 +10,7 @@ from support.playing import START_NS, recording
 from support.reading import ROUND_NS, Item, Rounds, block, stamps_in, stream
 
 from pmutools.c37118 import Message
-from pmutools.c37118 import demux as demux_module
-from pmutools.c37118.demux import Demux, Loss
+from pmutools.c37118.demux import Bounds, Demux, Loss
 from pmutools.flow import Chunk, StampSource
 from pmutools.formats import open_sink, open_source
 from pmutools.timebase import NS
@@ -114,10 +113,9 @@ def test_an_event_has_those_that_were_given_up_in_it(tmp_path: Path) -> None:
     assert ring.undecoded == len(undecoded_in(path)) == 20
 
 
-def test_what_waits_is_bounded_and_the_oldest_go_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_waits_is_bounded_and_the_oldest_go_first() -> None:
     """So a file is in order, and what is decoded in the end is what came last before the configuration."""
-    monkeypatch.setattr(demux_module, "HELD_BYTES", 5 * len(FRAMES[0]))
-    demux = Demux()
+    demux = Demux(bounds=Bounds(held_bytes=5 * len(FRAMES[0])))
     config, *data = recording(stream(9), 20, latency_ns=LATENCY_NS)
     found = [part for message in data for part in demux.feed(chunk_of(message))]
     assert demux.pending == 5 * len(FRAMES[0])
