@@ -53,13 +53,19 @@ def found(path: str) -> int:
 
 
 def keep(path: str, causes: int) -> str:
-    """Write the file whole, or remove it where there are no causes; why that could not be done, "" where it was."""
+    """Write the file whole, or remove it where there are no causes; why that could not be done, "" where it was.
+
+    Where the disk has no room for the causes the file is left without: it is a trip still.
+    """
+    trouble = ""
     try:
         if causes:
             new = path + ".new"
             handle = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
             try:
                 os.write(handle, text_of(causes))
+            except OSError as error:
+                trouble = f"{path}: {error.strerror}"
             finally:
                 os.close(handle)
             os.replace(new, path)
@@ -68,7 +74,7 @@ def keep(path: str, causes: int) -> str:
                 os.unlink(path)
     except OSError as error:
         return f"{path}: {error.strerror}"
-    return ""
+    return trouble
 
 
 class Latch:

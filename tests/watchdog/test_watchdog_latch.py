@@ -86,6 +86,15 @@ def test_why_it_cannot_be_written_or_removed(tmp_path: Path) -> None:
     assert keep(str(tmp_path / NAME), 1) != "" and keep(str(tmp_path / NAME), 0) != ""
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a file that is always full is Linux's")
+def test_on_a_full_disk_a_trip_is_kept_without_its_causes(tmp_path: Path) -> None:
+    path = str(tmp_path / NAME)
+    os.symlink("/dev/full", path + ".new")
+    assert keep(path, 1) == f"{path}: No space left on device"
+    assert found(path) == UNREADABLE and os.listdir(tmp_path) == [NAME]
+    assert keep(path, 1) == "" and found(path) == 1, "once there is room"
+
+
 # --- the thread --------------------------------------------------------------------------------------------------
 
 

@@ -398,6 +398,15 @@ def kept(*causes: int) -> tuple[str, list[tuple[str, bytes, int]]]:
     return said, files
 
 
+def kept_on_a_full_disk(causes: int) -> tuple[str, list[str], int]:
+    """What is said, which names are there, and what is found."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "latch")
+        os.symlink("/dev/full", path + ".new")
+        said = latch.keep(path, causes).replace(folder, "")
+        return said, os.listdir(folder), latch.found(path)
+
+
 LATCHED = [
     *of(latch.text_of, (3, b'{"causes": ["control", "udp"]}\n'), (rules.BIT["late"], b'{"causes": ["late"]}\n')),
     *of(latch.causes_in, *((text, latch.UNREADABLE) for text in (b"", b"{}", b'{"causes": []}', b'{"causes": ["x"]}'))),
@@ -407,6 +416,7 @@ LATCHED = [
     (kept, (3, 2), ("", [("latch", latch.text_of(2), 0o600)])),
     (kept, (3, 0), ("", [])),
     (kept, (0,), ("", [])),
+    (kept_on_a_full_disk, (3,), ("/latch: No space left on device", ["latch"], latch.UNREADABLE)),
 ]
 
 # --- the limits and the limiter ----------------------------------------------------------------------------------
@@ -557,6 +567,7 @@ ABOUT: dict[Callable[..., Any], FunctionType] = {
     found: rules.judge,
     left_there: latch.found,
     kept: latch.keep,
+    kept_on_a_full_disk: latch.keep,
 }  # type: ignore[dict-item]
 """What a fact is about, where that is not the function that it calls."""
 FUNCTIONS: dict[FunctionType, list[Fact]] = {function: [] for function in STEPS}
