@@ -75,6 +75,14 @@ def config_flood(site: Running) -> None:
         pass
 
 
+def stranger_flood(site: Running) -> None:
+    config = Streams(("N1",)).configs["N1"]
+    ever_others = [encode_config(replace(config, idcode=1000 + k)) for k in range(15_000)]
+    addresses = [f"127.1.{k // 250}.{1 + k % 250}" for k in range(800)]
+    with flood(site.ports[0], ever_others, 1.5, source=addresses):
+        pass
+
+
 def spoof(site: Running) -> None:
     with flood(site.ports[0], frames_now("N1"), 1.0, source="127.0.0.2"):
         pass
@@ -171,6 +179,13 @@ TRIALS = {
     "configurations": Trial(
         "10,000 configurations/s with a PMU's IDCODE, no two alike, from another address",
         config_flood,
+        "ACTIVE",
+        "closed",
+        (EVERY_TICK, OTHER_HEARD),
+    ),
+    "strangers": Trial(
+        "10,000 configurations/s of ever-changing IDCODEs from 800 other addresses",
+        stranger_flood,
         "ACTIVE",
         "closed",
         (EVERY_TICK, OTHER_HEARD),

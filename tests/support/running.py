@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -310,14 +310,15 @@ def command_line(pid: int) -> str:
 
 FLOOD = """
 import socket, sys, time
-port, seconds, source, per_s = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3], 10_000
+port, seconds, sources, per_s = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3:], 10_000
 datagrams = [bytes.fromhex(word) for word in sys.stdin.read().split()]
-sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-sock.bind((source, 0))
+socks = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for source in sources]
+for sock, source in zip(socks, sources):
+    sock.bind((source, 0))
 begun, sent = time.monotonic(), 0
 while sent < seconds * per_s:
     while sent < min(time.monotonic() - begun, seconds) * per_s:
-        sock.sendto(datagrams[sent % len(datagrams)], ("127.0.0.1", port))
+        socks[sent // 8 % len(socks)].sendto(datagrams[sent % len(datagrams)], ("127.0.0.1", port))
         sent += 1
     time.sleep(0.001)
 print(time.monotonic() - begun)
@@ -325,9 +326,15 @@ print(time.monotonic() - begun)
 
 
 @contextmanager
-def flood(port: int, datagrams: list[bytes], seconds: float, source: str = "127.0.0.1") -> Iterator[None]:
-    """Ten thousand datagrams a second from a process of its own, that many in all, in at most a quarter more."""
-    arguments = [sys.executable, "-c", FLOOD, str(port), str(seconds), source]
+def flood(
+    port: int, datagrams: list[bytes], seconds: float, source: str | Sequence[str] = "127.0.0.1"
+) -> Iterator[None]:
+    """Ten thousand datagrams a second from a process of its own, that many in all, in at most a quarter more.
+
+    Of several sources each sends eight in turn.
+    """
+    sources = [source] if isinstance(source, str) else source
+    arguments = [sys.executable, "-c", FLOOD, str(port), str(seconds), *sources]
     with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None and process.stdout is not None
         process.stdin.write(" ".join(data.hex() for data in datagrams))
