@@ -19,6 +19,7 @@ from pmutools.cli.shell import run
 UNITS = Path(__file__).parents[2] / "docs" / "systemd"
 PROGRAM = "/opt/pmutools/bin/dcon"
 SERVICES = sorted(UNITS.glob("*.service"))
+TARGET = UNITS / "dcon.target"
 
 
 def keys(unit: Path) -> dict[str, list[str]]:
@@ -36,7 +37,16 @@ def keys(unit: Path) -> dict[str, list[str]]:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_systemd_finds_nothing_wrong(tmp_path: Path) -> None:
-    units = [*SERVICES, UNITS / "dcon.target"]
+    verify(tmp_path, [*SERVICES, TARGET])
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_the_target_does_without_an_output(tmp_path: Path) -> None:
+    """Where a site has none, its unit is not installed."""
+    verify(tmp_path, [*(unit for unit in SERVICES if unit.stem != "dcon-output"), TARGET])
+
+
+def verify(tmp_path: Path, units: list[Path]) -> None:
     for unit in units:
         text = unit.read_text()
         assert text.count(PROGRAM) == (unit.suffix == ".service")
@@ -67,10 +77,29 @@ def test_what_must_be_in_a_unit(unit: Path) -> None:
     assert options == ["--ini", "/etc/dcon/site.ini", "--run-dir", "/var/lib/dcon/run"]
     assert found["Service.KillMode"] == ["mixed"]  # the others are ended by whoever started them, in order
     assert found["Service.RestartPreventExitStatus"] == ["2"]
-    assert found["Service.SuccessExitStatus"] == ["130"]
+    # of those that are told to end, the server alone still tells that ticks are missing
+    assert found["Service.SuccessExitStatus"] == ["3 130" if name == "server" else "130"]
     assert found["Service.StateDirectoryMode"] == ["0700"]  # nobody else may enter the run folder
     assert ("Service.WatchdogSec" in found) == (found["Service.Type"] == ["notify"])
     assert found["Service.Restart"] == ["on-failure"]
+    assert found["Unit.StartLimitIntervalSec"] == ["0"]  # by default, five failures in 10 s end it for good
+    # who listens or receives at an address of the site's needs it to be there
+    needs_network = name in ("run", "server", "platform")
+    for key in ("Unit.Wants", "Unit.After"):
+        assert needs_network == ("network-online.target" in " ".join(found[key]).split())
+
+
+def test_the_target_has_a_service_for_each_process() -> None:
+    (wanted,) = keys(TARGET)["Unit.Wants"]
+    assert set(wanted.split()) == {f"dcon-{member.name}.service" for member in STARTED}
+
+
+def test_one_way_ends_the_other_before_it_starts() -> None:
+    """Both meet in the same run folder."""
+    found = keys(UNITS / "dcon.service")
+    (others,) = found["Unit.Conflicts"]
+    assert set(others.split()) == {TARGET.name, *(unit.name for unit in SERVICES)} - {"dcon.service"}
+    assert set(others.split()) <= set(" ".join(found["Unit.After"]).split())
 
 
 def test_the_site_of_the_page_is_one_that_dcon_takes(capsys: pytest.CaptureFixture[str]) -> None:
