@@ -7,7 +7,10 @@ In ``README.md`` and ``docs/``:
 - every ``$ `` line of a ```` ```console ```` block is a command that click accepts;
 - under ``<!-- run -->`` (``<!-- run: slow -->``) they are run, one after the other, and print what the block says.
   A command that ends with ``&`` runs beside those after it, which wait until its
-  ports and sockets are there; it is interrupted at the end of the block. :data:`PORTS` are replaced by free ones.
+  ports and sockets are there; it is interrupted at the end of the block. :data:`PORTS` are replaced by free ones;
+- under ``<!-- run: live -->`` too, all blocks of a page as one, with a machine for themselves; ``kill %1`` ends the
+  first command that ends with ``&``; ``dcon ctl status`` is repeated until it sees what the block says;
+- a block under ``<!-- file: NAME -->`` is written to that file.
 
 ``...`` stands for anything that is printed.
 """
@@ -54,14 +57,14 @@ IMAGE_LIMIT_BYTES = 200_000
 TIME_LIMIT_S = 60
 INCOMPLETE, INTERRUPTED = 3, 130
 """Exit codes of a command that found damage, which an example may want to show, and of one that was ended."""
-PORTS = ("4712", "4713", "4790")
+PORTS = ("4712", "4713", "4790", "4801")
 """Examples use these; whoever runs the tests may use them too."""
 
 sys.path.insert(0, str(DOCS))
 from generate import GENERATORS, display, live  # noqa: E402
 from hooks import MARKER, filled  # noqa: E402
 
-BESIDE = "beside: "
+BESIDE, FILE = "beside: ", "file: "
 
 
 class Fence(NamedTuple):
@@ -108,9 +111,11 @@ def test_markers_and_generators_are_the_same() -> None:
 def test_a_page_has_no_marker_that_is_misspelt() -> None:
     for page, path in PAGES.items():
         comments = re.findall(r"<!--.*?-->", path.read_text(encoding="utf-8"))
-        plain = ("<!-- run -->", "<!-- run: slow -->")
+        plain, open_ended = ("<!-- run -->", "<!-- run: slow -->", "<!-- run: live -->"), (BESIDE, FILE)
         strange = [
-            c for c in comments if not MARKER.fullmatch(c) and c not in plain and not c.startswith(f"<!-- {BESIDE}")
+            c
+            for c in comments
+            if not MARKER.fullmatch(c) and c not in plain and not any(c.startswith(f"<!-- {one}") for one in open_ended)
         ]
         assert not strange, page
 
@@ -213,6 +218,8 @@ def opened(place: str) -> bool:
 def beside(command: str) -> Iterator[None]:
     """``command`` runs meanwhile, and is interrupted at the end."""
     listens = re.findall(r"(?:read|--listen|--control) \S*?(\d{4,5}|\./\S+)\b", command)
+    if run := re.match(r"dcon run --ini (\S+)", command):
+        listens += re.findall(r"^listen = \S+:(\d+)$", Path(run[1]).read_text(encoding="utf-8"), re.MULTILINE)
     process = subprocess.Popen(
         f"exec {command}", shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -228,30 +235,65 @@ def beside(command: str) -> Iterator[None]:
 
 
 def run_examples(page: str, marker: str) -> None:
+    """Each block by itself, with ports of its own."""
     for fence in fences(page):
         if fence.marker == marker:
-            with ExitStack() as stack:
-                run_block(page, fence, stack)
+            with Session(page) as session:
+                session.run(fence)
 
 
-def run_block(page: str, fence: Fence, stack: ExitStack) -> None:
-    ports = ports_to_use()
-    back = {free: port for port, free in ports.items()}
-    for shown, printed in steps(fence.text):
-        command = replaced(shown, ports)
-        if command.endswith(" &"):
-            stack.enter_context(beside(command.removesuffix(" &")))
-            continue
-        done = subprocess.run(
-            command, shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=TIME_LIMIT_S
-        )
-        output = replaced(done.stdout, back)
+class Session:
+    """A shell in which blocks are typed, beside the files of the page; what runs in its background ends with it."""
+
+    def __init__(self, page: str) -> None:
+        self.page = page
+        self.ports = ports_to_use()
+        self._jobs: list[ExitStack] = []
+        for fence in fences(page):
+            if fence.marker.startswith(FILE):
+                Path(fence.marker.removeprefix(FILE)).write_text(replaced(fence.text, self.ports), encoding="utf-8")
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with ExitStack() as all_jobs:
+            for job in self._jobs:
+                all_jobs.enter_context(job)
+
+    def run(self, fence: Fence) -> None:
+        for shown, printed in steps(fence.text):
+            command = replaced(shown, self.ports)
+            if command.endswith(" &"):
+                self._jobs.append(ExitStack())
+                self._jobs[-1].enter_context(beside(command.removesuffix(" &")))
+            elif number := re.fullmatch(r"kill %(\d)(?:; wait %\1)?", command):
+                self._jobs[int(number[1]) - 1].close()
+            else:
+                self._say(shown, command, printed)
+
+    def _say(self, shown: str, command: str, printed: str) -> None:
+        """Run a command that ends; a look (``dcon ctl status``) again, until it sees what it is said to."""
+        back = {free: port for port, free in self.ports.items()}
+        if command.startswith("dcon ctl ") and "--to" not in command:  # the default is a port of PORTS
+            command += f" --to 127.0.0.1:{self.ports['4790']}"
+        deadline = time.monotonic() + TIME_LIMIT_S
+        while True:
+            done = subprocess.run(
+                command, shell=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=TIME_LIMIT_S
+            )
+            output = replaced(done.stdout, back)
+            is_so = said(printed, output)
+            if is_so or not command.startswith("dcon ctl status") or time.monotonic() > deadline:
+                break
+            time.sleep(0.1)
         assert done.returncode in (0, INCOMPLETE), (shown, output)
-        assert said(printed, output), f"{page}: $ {shown}\n--- prints\n{output}--- is said to print\n{printed}"
+        assert is_so, f"{self.page}: $ {shown}\n--- prints\n{output}--- is said to print\n{printed}"
 
 
 RUN = [page for page in PAGES if any(fence.marker == "run" for fence in fences(page))]
 RUN_SLOW = [page for page in PAGES if any(fence.marker == "run: slow" for fence in fences(page))]
+RUN_LIVE = [page for page in PAGES if any(fence.marker == "run: live" for fence in fences(page))]
 posix = pytest.mark.skipif(os.name != "posix", reason="the examples are written for a POSIX shell")
 
 
@@ -268,6 +310,18 @@ def test_slow_examples_print_what_is_shown(page: str, folder: Path) -> None:
     run_examples(page, "run: slow")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="dcon run needs Linux")
+@pytest.mark.realtime
+@pytest.mark.alone
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN_LIVE)
+def test_live_examples_print_what_is_shown(page: str, folder: Path) -> None:
+    with Session(page) as session:
+        for fence in fences(page):
+            if fence.marker == "run: live":
+                session.run(fence)
+
+
 def test_the_comparison_can_fail() -> None:
     assert said("a ... c\n...", "a b c\nd\ne\n")
     assert not said("a ... c", "a b d")
@@ -282,8 +336,15 @@ ALIASES = {
     "stream-reader": ("pmu", "read"),
     "network-characterizer": ("pmu", "characterize"),
 }
-OTHERS = frozenset(("python", "head", "nc", "printf"))
+OTHERS = frozenset(
+    (
+        *("python", "python3", "head", "nc", "printf", "kill", "wait", "cat", "install", "cp", "rm", "mkdir"),
+        *("useradd", "usermod", "systemctl", "pip"),
+    )
+)
 """Programs of others that examples use."""
+INSTALLED = "/opt/pmutools/bin/"
+"""Where the commands are at a site."""
 
 
 def subcommand(words: list[str]) -> click.Command:
@@ -296,7 +357,7 @@ def subcommand(words: list[str]) -> click.Command:
 
 def parse(words: list[str]) -> None:
     """Let click read a command line, without running it; raises click.ClickException."""
-    first, *rest = words
+    first, *rest = words = [words[0].removeprefix(INSTALLED), *words[1:]]
     if first in ALIASES:
         parse([*ALIASES[first], *rest])
     elif first in GROUPS:
