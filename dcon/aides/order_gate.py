@@ -1,7 +1,7 @@
 """Signed orders on their way to the control process: who may pass is decided here, and nowhere else.
 
-The server only hands on what operators have signed; it cannot make an order. What is refused becomes an input of the
-controller too, so that it is in the session log and replays.
+The server hands on what operators have signed, unchanged, and its own judgement of it counts for nothing here. What is
+refused becomes an input of the controller too, so that it is in the session log and replays.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class OrderGate:
         self._refusals = RefusalLog()
         self.refused = 0
         self.malformed = 0
-        """Datagrams that are not even ``{"kind": "signed", ...}``."""
+        """Datagrams that are not even ``{"kind": "signed", ...}``, or whose ``reply_to`` no path can be."""
 
     def take(self, datagram: bytes, now_ns: int, utc_ns: int) -> Passed:
         """Judge ``{"kind": "signed", "order": HEX, "reply_to": PATH}``. Never raises.

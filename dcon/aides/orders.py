@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import select
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +42,22 @@ class GuiAide(Aide):
         if passed.reply is not None:
             replies.append(Reply(passed.reply_to, passed.reply))
         for path, said in replies:
-            self._reply(Path(path), said)
+            self._reply(path, said)
 
     def counts(self) -> dict[str, int]:
         gate = self.gate
         own = {"orders_refused": gate.refused, "orders_malformed": gate.malformed, "orders_lost": self.handing.lost}
         return super().counts() | own
 
-    def _reply(self, where: Path, reply: dict[str, Any]) -> None:
+    def _reply(self, path: str, reply: dict[str, Any]) -> None:
         """To a name in the run folder only: who writes to this loop must not have it write elsewhere."""
-        if where.name and where.parent.resolve() == self._run_dir:
-            sender = Sender(where)
-            sender.send(json.dumps(reply).encode())
-            sender.close()
+        where = Path(path)
+        try:
+            if where.name and where.parent.resolve() == self._run_dir:
+                with closing(Sender(where)) as sender:
+                    sender.send(json.dumps(reply).encode())
+        except (OSError, ValueError, RuntimeError):  # a NUL, what is no text, links in a ring: no path can be that
+            self.gate.malformed += 1
 
     def release(self) -> None:
         super().release()

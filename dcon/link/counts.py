@@ -33,7 +33,7 @@ COUNTS: Final[Mapping[str, str]] = {
     "unsent": "commands that the system refused to send, or that nobody listened to",
     "news_ignored": "datagrams to the control process that say nothing it knows",
     "orders_refused": "orders whose signature, age, sequence or right did not hold; the log has up to ten a second",
-    "orders_malformed": "datagrams from the server that hold no order",
+    "orders_malformed": "datagrams from the server that hold no order, or name no place that could be answered",
     "orders_lost": "orders, and refusals of some, that the control process did not take",
     "line_foreign": "statuses of the line from another address than the one that is set",
     "line_refused": "statuses of the line that are malformed, old, no number, or from the future",

@@ -2,7 +2,8 @@
 
 One line of JSON: ``{"who", "sequence", "time_ns", "name", "value", "text", "why", "mac"}``. ``mac`` is the HMAC-SHA256
 (RFC 2104) under the operator's key over the JSON of the rest, keys sorted, no spaces, ASCII only; 64 hexadecimal
-digits. Who relays an order has no key and can forge none.
+digits. Who has the key can make an order, and nobody else: the operator, and each process that reads the key file to
+judge what comes (the aides; the server, for the watchdog).
 """
 
 from __future__ import annotations

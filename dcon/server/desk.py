@@ -1,7 +1,9 @@
 """What operators may ask, and what they are told: the same for a line of a socket and, one day, for a web page.
 
 An ask is a JSON object: ``{"ask": "status"}``, ``{"ask": "watch"}``, or ``{"signed": "<a signed order>"}``. Orders are
-relayed as they are; only the controller and the watchdog act, and the server has no key of its own.
+handed on as they were signed, for the platform's own link to judge. The server reads the same key file and judges them
+too: of ``estop``, ``release`` and ``reset`` it tells the watchdog itself, which takes its word. So whoever takes the
+server over has the operators' keys, and can order whatever they may.
 """
 
 from __future__ import annotations

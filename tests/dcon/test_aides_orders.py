@@ -178,6 +178,32 @@ def test_the_loop_passes_on_and_replies_within_the_folder_only(folder: Path, tmp
 
 
 @pytest.mark.realtime
+@pytest.mark.parametrize(
+    ("place", "malformed"),
+    [
+        ("\0/a", 1),
+        ("{folder}/\0/a", 1),
+        ("\ud800/a", 1),
+        ("{folder}/\udfff", 1),
+        ("{folder}/ring/a", 1),
+        ("{folder}", 0),
+    ],
+)
+def test_an_order_counts_whose_answer_can_go_nowhere(place: str, malformed: int, folder: Path) -> None:
+    (folder / "ring").symlink_to(folder / "ring")
+    with listening(folder, CONTROL) as (control,):
+        aide = GuiAide(gate(folder, time.time_ns()), folder)
+        with in_thread(aide.run, aide.stop):
+            order = signed(folder, "estop", time_ns=time.time_ns())
+            for _ in range(2):  # the second is a replay, and would be answered at once
+                send(folder, AIDE, datagram(order, place.format(folder=folder)))
+            send(folder, AIDE, datagram(signed(folder, "disarm", time_ns=time.time_ns())))
+            wait_for(lambda: len(control.said("order")) == 3)
+        assert aide.failure == "" and aide.gate.malformed == malformed
+        assert [news["name"] for news in control.said("order")] == ["estop", "link_refused", "disarm"]
+
+
+@pytest.mark.realtime
 def test_the_server_hears_why_an_order_of_its_operator_was_refused(folder: Path) -> None:
     operators = read_keys(folder / "keys")
     with listening(folder, CONTROL, REPLIES) as (control, replies):
