@@ -8,18 +8,19 @@ armed again but by an operator.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import select
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
 from dcon.household.ear import ear_of
-from dcon.household.member import ENDED, PLATFORM, STARTED, Supervised
+from dcon.household.member import ENDED, PLATFORM, SERVER, STARTED, Supervised
 from dcon.household.predecessor import await_places
 from dcon.link.children import HUNG_S, ending
 from dcon.link.notify import ALIVE, READY, STOPPING, Notifier
@@ -30,6 +31,8 @@ START_S = 30.0
 """For a process to be ready, on a busy machine: the controller may wait 10 s for the watchdog."""
 ROUND_S = 1.0
 """The longest between two rounds: so often systemd is told that all is well."""
+SOON_S = 0.25
+"""A server is started again as soon as this while the controller ends, however often it has died."""
 FAILED, USAGE = 1, 2
 """Exit codes of a process that has said why; of the latter it was set up wrongly, and would be the same again."""
 MOST_SAID = 256
@@ -89,6 +92,7 @@ class Household:
         self.stopping = False
         self._over = False
         self._starting = True
+        self._ending = False
         self._is_over = is_over
         self._commands = commands
         self._notifier = notifier or Notifier({})
@@ -155,29 +159,40 @@ class Household:
 
     def _round(self) -> None:
         """Wait for news, at most ROUND_S, and see to everybody. Raises SourceError for one that cannot start."""
-        now_s = time.monotonic()
-        waiting = [each.again_s - now_s for each in self._running.values() if each.process is None]
-        self._poll.poll(1000 * max(min([ROUND_S, *waiting]), 0.0))
-        with suppress(BlockingIOError):
-            os.read(self._wake, 4096)
-        last_s, self._round_s = self._round_s, time.monotonic()
-        passed_s = min(self._round_s - last_s, ROUND_S)  # where the whole machine stood still, nobody has hung
+        passed_s = self._pause(ROUND_S, self._running.values())
         for each in self._running.values():
-            has_ended = each.listen(passed_s)
-            if each.process is not None:
-                if has_ended:
-                    self._bury(each)
-                else:
-                    self._judge(each)
-            elif time.monotonic() >= each.again_s and not self.stopping:
-                try:
-                    each.start(self._commands[each.member.name]())
-                except SourceError as error:
-                    self._put_off(each, str(error))
+            self._see_to(each, passed_s)
         if self._starting:
             return
         missing = [name for name, each in self._running.items() if each.process is None]
         self._notifier.tell(ALIVE, status=f"waiting to restart {', '.join(missing)}" if missing else "running")
+
+    def _pause(self, most_s: float, of: Iterable[Supervised]) -> float:
+        """Wait for news, or until one of these is to be started again; how long ago the last such wait was over."""
+        now_s = time.monotonic()
+        waiting = [each.again_s - now_s for each in of if each.process is None]
+        self._poll.poll(1000 * max(min([most_s, *waiting]), 0.0))
+        with suppress(BlockingIOError):
+            os.read(self._wake, 4096)
+        last_s, self._round_s = self._round_s, time.monotonic()
+        return min(self._round_s - last_s, ROUND_S)  # where the whole machine stood still, nobody has hung
+
+    def _see_to(self, each: Supervised, passed_s: float) -> None:
+        """Raises SourceError for one that cannot start."""
+        has_ended = each.listen(passed_s)
+        if each.process is None:
+            if time.monotonic() >= each.again_s and (self._ending or not self.stopping):
+                self._start_again(each)
+        elif has_ended:
+            self._bury(each)
+        else:
+            self._judge(each)
+
+    def _start_again(self, each: Supervised) -> None:
+        try:
+            each.start(self._commands[each.member.name]())
+        except SourceError as error:
+            self._put_off(each, str(error))
 
     def _judge(self, each: Supervised) -> None:
         """Kill one that hangs."""
@@ -207,7 +222,7 @@ class Household:
     def _put_off(self, each: Supervised, why: str) -> None:
         name = each.member.name
         self.outcome.restarts[name] = self.outcome.restarts.get(name, 0) + 1
-        LOG.warning("%s; started again in %g s", why, each.put_off())
+        LOG.warning("%s; started again in %g s", why, each.put_off(SOON_S if self._ending else math.inf))
 
     def _close(self, each: Supervised) -> int:
         code, text = each.bury()
@@ -223,13 +238,12 @@ class Household:
 
     def _end(self) -> None:
         self._notifier.tell(STOPPING, status="ending")
+        self._ending = True
         try:
             for member in ENDED:
                 each = self._running.get(member.name)
                 if each is not None and each.process is not None:
-                    self._notifier.tell(ALIVE)
-                    each.ask_to_end()
-                    self._close(each)
+                    self._end_of(each)
         finally:
             for each in self._running.values():
                 if each.process is not None:
@@ -238,3 +252,26 @@ class Household:
                 each.ear.close()
             os.close(self._wake)
             os.close(self._woken)
+
+    def _end_of(self, each: Supervised) -> None:
+        """Ask it to end, and wait; kill it where it takes too long.
+
+        The server is looked after as long as the controller ends, and started again at once: the log's end goes to it.
+        """
+        server = self._running.get(SERVER.name) if each.member is PLATFORM else None
+        end_s = each.ask_to_end()
+        if server is not None and server.process is None:
+            self._start_again(server)
+        while each.process is not None:
+            self._notifier.tell(ALIVE)
+            left_s = max(end_s - time.monotonic(), 0.0)
+            passed_s = self._pause(min(left_s, ROUND_S), () if server is None else (server,))
+            for other in self._running.values():
+                if other is server:
+                    self._see_to(other, passed_s)
+                elif other.listen(passed_s):
+                    self._close(other)
+            if each.process is not None and time.monotonic() >= end_s:
+                LOG.error("the %s process does not end, and is killed", each.member.name)
+                each.process.kill()
+                self._close(each)

@@ -38,7 +38,9 @@ SERVER = Member("server", paths.SERVER, socket.SOCK_SEQPACKET, 15.0)
 OUTPUT = Member("output", paths.OUTPUT)
 PLATFORM = Member("platform", paths.CONTROL, patience_s=10.0)
 SPEAKERS = (SERVER, PLATFORM)
-"""Their standard output is kept: what they say of the run at its end."""
+"""Their standard output is kept, in memory: what they say of the run at its end."""
+SAID_BYTES = 1 << 20
+"""Of which so much is read."""
 STARTED = (WATCHDOG, SERVER, OUTPUT, PLATFORM)
 """In this order; who is not needed is left out."""
 ENDED = (PLATFORM, SERVER, WATCHDOG, OUTPUT)
@@ -60,17 +62,20 @@ class Supervised:
         self.ear = Ear(folder, member.name)
         self._poll = poll
         self._pidfd = -1
+        self._said: int | None = None
+        """A file for the standard output of the present life: no pipe, which may fill, and which others may hold."""
         self._started_s = 0.0
         self._backoff = Backoff()
         self.ear.register(poll)
 
     def start(self, command: Sequence[str]) -> None:
         """Raises SourceError where the system has no room for one more."""
-        out = subprocess.PIPE if self.member in SPEAKERS else subprocess.DEVNULL
         self.ear.begin()
         self._started_s = time.monotonic()
         environment = {**os.environ, "NOTIFY_SOCKET": self.ear.path}
         try:
+            self._said = os.memfd_create(self.member.name) if self.member in SPEAKERS else None
+            out = subprocess.DEVNULL if self._said is None else self._said
             self.process = launch(command, dies_by=signal.SIGTERM, stdout=out, env=environment)
             self._pidfd = os.pidfd_open(self.process.pid)
         except (OSError, subprocess.SubprocessError) as error:
@@ -85,8 +90,7 @@ class Supervised:
         if process is not None:
             process.kill()
             process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
+        self._last_words()
 
     def listen(self, passed_s: float) -> bool:
         """Hear what it says, ``passed_s`` after the last time; whether it has ended, its last words heard too."""
@@ -101,31 +105,34 @@ class Supervised:
             self.process.kill()
             self.ear.silent_s = 0.0
 
-    def put_off(self) -> float:
+    def put_off(self, most_s: float = math.inf) -> float:
         """It does not run: seconds until it is started again, the more the more often that has happened."""
         now_s = time.monotonic()
         self._backoff, wait_s = self._backoff.ended(now_s - self._started_s)
+        wait_s = min(wait_s, most_s)
         self.again_s = now_s + wait_s
         return wait_s
 
-    def ask_to_end(self) -> None:
-        """And wait; kill it where it takes too long."""
+    def ask_to_end(self) -> float:
+        """When it is to have ended, by the monotonic clock."""
         assert self.process is not None
         self.process.terminate()
-        try:
-            self.process.wait(self.member.patience_s)
-        except subprocess.TimeoutExpired:
-            LOG.error("the %s process does not end, and is killed", self.member.name)
-            self.process.kill()
+        return time.monotonic() + self.member.patience_s
 
     def bury(self) -> tuple[int, str | None]:
         """Its exit code, once it has ended, and what it wrote, where that is kept."""
         process, self.process = self.process, None
         assert process is not None
-        code, said = process.wait(), None
-        if process.stdout is not None:
-            said = process.stdout.read()
-            process.stdout.close()
+        code = process.wait()
         self._poll.unregister(self._pidfd)
         os.close(self._pidfd)
-        return code, said
+        return code, self._last_words()
+
+    def _last_words(self) -> str | None:
+        """What it wrote, which is all there will be."""
+        said, self._said = self._said, None
+        if said is None:
+            return None
+        text = os.pread(said, SAID_BYTES, 0).decode(errors="replace")
+        os.close(said)
+        return text

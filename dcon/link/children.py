@@ -56,7 +56,8 @@ class Children:
         self._before = signal.signal(signal.SIGCHLD, self._ring)
 
     def start(self, name: str, arguments: Sequence[str], pass_fds: Sequence[int] = ()) -> None:
-        self.processes[name] = launch(arguments, pass_fds=pass_fds)
+        """Its standard output is nobody's: who reads this process's waits for nobody else's end."""
+        self.processes[name] = launch(arguments, pass_fds=pass_fds, stdout=subprocess.DEVNULL)
 
     def trouble(self) -> str:
         """Who has ended, in words; "" while all are there."""

@@ -20,6 +20,7 @@ import pytest
 from dcon.household import household, member, predecessor
 from dcon.household.household import Household, NotStarted
 from dcon.household.member import ENDED, STARTED
+from dcon.link.children import Children
 from dcon.link.notify import Notifier
 from dcon.link.paths import CONTROL, bind_datagram, prepare
 from pmutools.errors import SourceError
@@ -34,7 +35,9 @@ path, kind, log, name, life, code, deaf = sys.argv[1:]
 def note(what):
     with open(log, "a") as file: file.write(f"{what} {name} {os.getpid()} {time.monotonic_ns()}\\n")
 def end(*_):
-    note("term"); sys.exit(int(code))
+    note("term")
+    while deaf.isdigit() and open(log).read().count("start server") < int(deaf): time.sleep(0.01)
+    sys.exit(int(code))
 signal.signal(signal.SIGTERM, signal.SIG_IGN if deaf == "deaf" else end)
 signal.signal(signal.SIGINT, lambda *_: note("int"))
 if os.path.exists(path): os.unlink(path)
@@ -47,7 +50,7 @@ def tell(what): teller.sendto(what, os.environ["NOTIFY_SOCKET"])
 if deaf != "unready": tell(b"READY=1\\nWATCHDOG=1")
 end_s = time.monotonic() + float(life)
 while (rest_s := end_s - time.monotonic()) > 0:
-    if deaf == "-": tell(b"WATCHDOG=1")
+    if deaf not in ("deaf", "unready"): tell(b"WATCHDOG=1")
     time.sleep(min(0.05, rest_s))
 print('{"ticks": 7}')
 note("over"); sys.exit(int(code))
@@ -65,6 +68,8 @@ class House:
         """(seconds, exit code) of each life, by name; the last goes on."""
         self.deaf = ""
         """Who does not end when asked to."""
+        self.awaits = 0
+        """So many starts of the server the platform awaits before it ends: to hand it the log."""
         self.unready = ""
         """Who never says that it is ready."""
         names = [member.name for member in STARTED if output or member.name != "output"]
@@ -78,7 +83,8 @@ class House:
             life_s, code = lives.pop(0) if len(lives) > 1 else lives[0]
             words = (self.folder / member.inbox, int(member.kind), self.log, name, life_s, code)
             how = "deaf" if name == self.deaf else "unready" if name == self.unready else "-"
-            return ["-c", STAND_IN, *map(str, words), how]
+            awaits = self.awaits if name == "platform" else 0
+            return ["-c", STAND_IN, *map(str, words), str(awaits or how)]
 
         return made
 
@@ -312,6 +318,44 @@ def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.Mon
     house.household.run()
     assert house.events("term") == ["watchdog"] or house.events("term") == ["platform", "watchdog"]
     assert house.is_empty()
+
+
+@pytest.mark.parametrize("deaths", [1, 4])
+def test_a_server_that_has_died_is_started_again_while_the_controller_ends(deaths: int, tmp_path: Path) -> None:
+    """At once, however often it has died before: the fourth time it would be put off for 2 s."""
+    house = House(tmp_path)
+    house.lives["server"] = [(0.2, 1)] * deaths + [(60, 0)]
+    house.awaits = deaths + 1
+    house.stop_when(lambda: house.events("over").count("server") == deaths and "platform" in house.events("start"))
+    began_s = time.monotonic()
+    assert house.household.run().restarts == {"server": deaths}
+    assert house.events("start").count("server") == deaths + 1
+    assert house.events("term") == ["platform", "server", "watchdog"]
+    assert time.monotonic() - began_s < 9  # the platform is killed after 10 s
+    assert house.is_empty()
+
+
+def test_who_holds_the_standard_output_of_one_that_has_ended_holds_nobody_up(tmp_path: Path) -> None:
+    """And what it says may be longer than a pipe is."""
+    house = House(tmp_path)
+    heir = "import subprocess; left = subprocess.Popen(['sleep', '60']); print(left.pid, 100_000 * 'x')"
+    house.household._commands["platform"] = lambda: ["-c", heir]  # type: ignore[index]
+    began_s = time.monotonic()
+    (said,) = house.household.run().said["platform"]
+    pid, _, rest = said.partition(" ")
+    os.kill(int(pid), signal.SIGKILL)
+    assert rest == 100_000 * "x" + "\n" and time.monotonic() - began_s < 30
+    assert house.is_empty()
+
+
+def test_a_child_of_the_controller_has_no_part_in_its_standard_output(tmp_path: Path) -> None:
+    children, said = Children(), tmp_path / "said"
+    try:
+        children.start("front", ("-c", f"import os; open({str(said)!r}, 'w').write(os.readlink('/proc/self/fd/1'))"))
+        assert children.processes["front"].wait(20) == 0
+    finally:
+        children.close()
+    assert said.read_text() == os.devnull
 
 
 def test_a_stop_while_they_start_ends_what_has_started(tmp_path: Path) -> None:
