@@ -19,16 +19,16 @@ from dcon.link.orders import LONGEST, SignedOrder, Verifier
 from dcon.link.paths import AIDE, WATCHDOG, Sender
 from dcon.server.newest import TickSummary
 from dcon.server.pending import Answer, Pending
+from dcon.server.watchdog_word import TOLD, UNREACHED, Told, WatchdogWord
 
 LOG = logging.getLogger(__name__)
 ASKS = ("status", "watch")
 VERBS = {"estop": Verb.ESTOP, "release": Verb.ESTOP_RELEASE, "reset": Verb.RESET}
 """Orders that are the watchdog's too: it is told at once, whatever the controller makes of them."""
-TOLD, UNREACHED = "was told", "could not be reached"
 
 
 class Desk:
-    """Answers asks. An ask's answer comes at once, or (None) from :meth:`heard`, :meth:`reply` or :meth:`expired`."""
+    """Answers asks. An ask's answer comes at once, or (None) from :meth:`heard`, :meth:`reply` or :meth:`due`."""
 
     def __init__(self, folder: Path, status: Callable[[], dict[str, Any]], verifier: Verifier) -> None:
         """``verifier`` is asked before the watchdog is told; where it knows no operators, nobody orders anything."""
@@ -75,6 +75,10 @@ class Desk:
                 return self.pending.refused(name, reason)
         return []
 
+    def due(self, word: WatchdogWord, now_ns: int) -> list[Answer]:
+        """To orders that the controller has not spoken of in time, or of which the watchdog's word is known now."""
+        return self.pending.expired(now_ns) + self.pending.settled(lambda told: word.after(told, now_ns))
+
     def forget(self, asker: Hashable) -> None:
         """It is gone: nobody waits for its answers any more."""
         self.pending.forget(asker)
@@ -91,27 +95,33 @@ class Desk:
         if not self._verifier.operators:
             return {"refused": "this server knows no operators: set keys in [server]"}
         order = self._verifier.verify(signed, utc_ns)
-        also: dict[str, Any] = {}
+        told: Told | None = None
         if isinstance(order, SignedOrder):
             self.proven.add(asker)
-            also = self._tell_watchdog(order)
+            told = self._tell_watchdog(order, now_ns)
         if self.pending.is_full(proven=isinstance(order, SignedOrder)):
+            also = {} if told is None else {"watchdog": TOLD if told.reached else UNREACHED}
             return {"refused": "too many orders are on their way", **also}
         self.relayed += 1
         message = {"kind": "signed", "order": signed.hex(), "reply_to": self.reply_to}
-        if not self._aide.send(json.dumps(message).encode()):
-            return {"refused": "the controller cannot be reached", **also}
-        self.pending.add(asker, signed, now_ns, also)
+        if self._aide.send(json.dumps(message).encode()):
+            self.pending.add(asker, signed, now_ns, told)
+            return None
+        refused = {"refused": "the controller cannot be reached"}
+        if told is None:
+            return refused
+        self.pending.hold(asker, refused, told)
         return None
 
-    def _tell_watchdog(self, order: SignedOrder) -> dict[str, Any]:
-        """What the answer says of that. The controller judges the order for itself."""
+    def _tell_watchdog(self, order: SignedOrder, now_ns: int) -> Told | None:
+        """None for what is no order of its. The controller judges the order for itself."""
         if order.name not in VERBS:
-            return {}
-        if not self._watchdog.send(encode_word(VERBS[order.name], order.who)):
-            return {"watchdog": UNREACHED}
-        LOG.warning("%s by %s: the watchdog was told", order.name, order.who)
-        return {"watchdog": TOLD}
+            return None
+        verb = VERBS[order.name]
+        told = Told(verb, now_ns, self._watchdog.send(encode_word(verb, order.who)))
+        if told.reached:
+            LOG.warning("%s by %s: the watchdog was told", order.name, order.who)
+        return told
 
 
 def _error(text: str) -> dict[str, Any]:

@@ -107,7 +107,7 @@ class Server:
                     self._safely(key.data, events)
                 now_ns = clock.monotonic_ns()
                 self._acknowledge()
-                self.operators.answer(self.desk.pending.expired(now_ns))
+                self.operators.answer(self.desk.due(self._word, now_ns))
                 if not self._scribe.has_room:  # what waits to be read would wake us again and again
                     clock.sleep_until(now_ns + BREATH_NS)
                 self._pulse.beat(now_ns)

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -223,27 +223,6 @@ def test_a_controller_that_hangs_is_told_in_the_first_line(site: Site, capsys: p
     site.until(lambda: site.status()["controller_connected"])
 
 
-def test_the_watchdog_s_own_word_counts_and_ages(site: Site) -> None:
-    """Whatever the control log says of it: here that the relays are closed."""
-    site.platform.control.watchdog = Watchdog(5, True)
-    word = paths.Sender(site.run_dir / paths.STATUS)
-    word.send(b"nonsense")
-    word.send(encode_status(1, time.monotonic_ns() + 3600 * NS, 0, 7, 2, False, 1 << CAUSE_BITS.index("control")))
-    said = site.status()["watchdog"]
-    assert (said["source"], said["relays_closed"], said["latched"], said["estop"]) == ("watchdog", False, True, False)
-    assert said["causes"] == ["control"] and 0 <= said["age_ms"] <= 100 and not said["silent"]
-    assert status_text.relays(said).startswith("relays open; tripped; causes: control")
-    site.until(lambda: site.status()["watchdog"]["silent"])  # one from the future ages too
-    said = site.status()["watchdog"]
-    assert said["age_ms"] > 100 and said["source"] == "watchdog"
-    assert said["relays_closed"] is said["latched"] is said["estop"] is said["causes"] is None
-    assert status_text.relays(said).startswith(SILENT) and status_text.relays(said).endswith(
-        "relays open; tripped; causes: control"
-    )
-    assert site.status()["server"]["malformed"] == 1
-    word.close()
-
-
 def test_watch_comes_twice_a_second(site: Site) -> None:
     with Client(site.where) as client:
         client.send({"ask": "watch"})
@@ -417,6 +396,8 @@ def test_the_log_tells_of_orders_and_refusals(site: Site) -> None:
     [
         (("gain",), "gain: write gain MW_PER_MHZ"),
         (("gain", "x"), "gain: 'x' is not a number"),
+        (("gain", "-3"), "gain: -3 is out of range; it must be 0 to 1e+06"),
+        (("gain", "-0.5e1"), "gain: -0.5e1 is out of range; it must be 0 to 1e+06"),
         (("arm", "5"), "arm takes no value"),
         (("status", "5"), "status takes no value"),
     ],
@@ -424,27 +405,149 @@ def test_the_log_tells_of_orders_and_refusals(site: Site) -> None:
 def test_mistakes_are_a_line(words: tuple[str, ...], said: str, site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     assert site.ctl(*words) == 2
     assert capsys.readouterr().err == f"dcon: {said}\n"
+    assert site.ctl("gain", "--hwo", "Ada") == 2
+    err = capsys.readouterr().err
+    assert "No such option '--hwo'" in err and "--who" in err
     assert site.ctl("arm", key=False) == 2 and "give --key FILE" in capsys.readouterr().err
     assert site.ctl("arm", who=None) == 2 and "name one with --who" in capsys.readouterr().err
     assert site.ctl("arm", who="Eve") == 2 and "has no operator 'Eve'; there are Ada, Ben" in capsys.readouterr().err
+
+
+def test_the_watchdog_s_own_word_counts_and_ages(site: Site) -> None:
+    """Whatever the control log says of it: here that the relays are closed."""
+    site.platform.control.watchdog = Watchdog(5, True)
+    word = paths.Sender(site.run_dir / paths.STATUS)
+    word.send(b"nonsense")
+    word.send(encode_status(1, time.monotonic_ns() + 3600 * NS, 0, 7, 2, False, 1 << CAUSE_BITS.index("control")))
+    said = site.status()["watchdog"]
+    assert (said["source"], said["relays_closed"], said["latched"], said["estop"]) == ("watchdog", False, True, False)
+    assert said["causes"] == ["control"] and 0 <= said["age_ms"] <= 100 and not said["silent"]
+    assert status_text.relays(said).startswith("relays open; tripped; causes: control")
+    site.until(lambda: site.status()["watchdog"]["silent"])  # one from the future ages too
+    said = site.status()["watchdog"]
+    assert said["age_ms"] > 100 and said["source"] == "watchdog"
+    assert said["relays_closed"] is said["latched"] is said["estop"] is said["causes"] is None
+    assert status_text.relays(said).startswith(SILENT) and status_text.relays(said).endswith(
+        "relays open; tripped; causes: control"
+    )
+    assert site.status()["server"]["malformed"] == 1
+    word.close()
+
+
+TOLD = "the watchdog was told"
+RELAYS = "the relays may be closed still; use the emergency stop button"
+AFTER = [
+    ("reset", (0, 0, 7, 0, True, 0), 0, f"reset: accepted; STATE; {TOLD}, and is not tripped"),
+    (
+        "reset",
+        (0, 0, 7, 2, False, 1 << CAUSE_BITS.index("control")),
+        0,
+        f"reset: accepted; STATE; {TOLD}, and is still tripped: control; when that is over, order it again",
+    ),
+    ("reset", (0, 0, 7, 2, False, 0), 0, f"reset: accepted; STATE; {TOLD}, and is still tripped: order it again"),
+    ("release", (0, 0, 7, 2, False, 1), 0, f"release: accepted; STATE; {TOLD}"),
+    ("estop", (0, 0, 6, 2, False, 0), 0, f"estop: accepted; STATE; {TOLD}"),
+    (
+        "estop",
+        (0, 3, 7, 1, True, 0),
+        1,
+        f"dcon: estop accepted; STATE, and the controller drives 0 V; {TOLD}, and its relays are closed still: "
+        f"{RELAYS}",
+    ),
+]
+
+
+def stateless(said: str) -> str:
+    """Ticks are made at random: their state says nothing."""
+    return re.sub("accepted; [A-Z]+", "accepted; STATE", said)
+
+
+@contextmanager
+def speaking(site: Site, status: tuple[Any, ...]) -> Iterator[None]:
+    """As the watchdog does, each 20 ms."""
+    over = threading.Event()
+    word = paths.Sender(site.run_dir / paths.STATUS)
+    counter, relays, *rest = status
+
+    def run() -> None:
+        while not over.wait(0.02):
+            word.send(encode_status(counter, time.monotonic_ns(), relays, *rest))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        word.close()
+
+
+@pytest.mark.parametrize(("verb", "status", "code", "said"), AFTER, ids=[f"{case[0]}-{case[1]}" for case in AFTER])
+def test_what_the_watchdog_made_of_it_is_said(
+    verb: str, status: tuple[Any, ...], code: int, said: str, site: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By its own status, of after it was told."""
+    site.words()
+    with speaking(site, status):
+        assert site.ctl(verb) == code
+    assert stateless(capsys.readouterr().err) == f"{said}\n"
+
+
+def test_a_watchdog_that_is_told_and_says_nothing_and_one_that_is_not_there(
+    site: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing opens the relays for the controller: a stop that only it takes is none."""
+    accepted = "dcon: estop accepted; STATE, and the controller drives 0 V; the watchdog "
+    site.until(lambda: site.status()["watchdog"]["silent"])
+    site.words()
+    assert site.ctl("estop") == 1
+    assert stateless(capsys.readouterr().err) == f"{accepted}was told, and has said nothing since: {RELAYS}\n"
+    paths.release(site.watchdog)
+    try:
+        assert site.ctl("estop", "--json") == 1
+        out, err = capsys.readouterr()
+        assert stateless(err) == f"{accepted}could not be reached: {RELAYS}\n"
+        assert json.loads(out)["accepted"] == "estop" and json.loads(out)["watchdog"] == "could not be reached"
+        assert site.ctl("estop", who="Ben") == 1
+        said = "refused: not allowed to this operator: nothing was stopped by this; use the emergency stop button"
+        assert capsys.readouterr().err == f"dcon: estop {said}\n"
+    finally:
+        site.watchdog = bind_datagram(site.run_dir, paths.WATCHDOG)
 
 
 def test_a_deaf_controller_and_none_at_all(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     site.platform.deaf = True
     began = time.monotonic()
     site.words()
-    stopped = "dcon: estop: the watchdog was told, and opens the relays; the controller has "
-    assert site.ctl("estop") == 0 and 1.9 < time.monotonic() - began < 6
-    said = f"{stopped}not answered: the controller has not answered in 2 s\n"
-    assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
-    site.platform.end()
-    assert site.ctl("estop") == 0
-    said = f"{stopped}refused: the controller cannot be reached\n"
-    assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
-    assert site.ctl("reset") == 1 and site.words() == [(3, b"Ada")]
-    said = "dcon: reset refused: the controller cannot be reached; the watchdog was told\n"
-    assert capsys.readouterr().err == said
+    stopped = "dcon: estop: the watchdog was told, and opens the relays; the controller "
+    with speaking(site, (0, 0, 6, 2, False, 0)):
+        assert site.ctl("estop") == 0 and 1.9 < time.monotonic() - began < 6
+        said = f"{stopped}may not have taken it: the controller has not answered in 2 s\n"
+        assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
+        site.platform.end()
+        assert site.ctl("estop") == 0
+        said = f"{stopped}did not take it: the controller cannot be reached\n"
+        assert capsys.readouterr().err == said and site.words() == [(1, b"Ada")]
+        assert site.ctl("reset") == 1 and site.words() == [(3, b"Ada")]
+        said = "dcon: reset refused: the controller cannot be reached; the watchdog was told, and is still tripped"
+        assert capsys.readouterr().err == f"{said}: order it again\n"
     site.until(lambda: site.status()["controller_connected"] is False)
     assert site.server.end() == 0
     assert site.ctl("status") == 1
     assert capsys.readouterr().err.endswith("is dcon server running there?\n")
+    assert site.ctl("estop") == 1
+    said = "is dcon server running there?; take nothing as stopped by this: use the emergency stop button\n"
+    assert capsys.readouterr().err.endswith(said)
+
+
+def test_a_server_that_hangs_is_no_emergency_stop(
+    site: Site, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client_side, "PATIENCE_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        monkeypatch.setattr(site.server, "port", deaf.getsockname()[1])
+        assert site.ctl("estop") == 1 and site.ctl("arm") == 1
+    stop, arm = capsys.readouterr().err.splitlines()
+    assert stop.endswith("no answer in 0.5 s; take nothing as stopped by this: use the emergency stop button")
+    assert arm.endswith("no answer in 0.5 s")
