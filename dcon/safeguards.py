@@ -17,6 +17,7 @@ from dcon.link import paths
 from dcon.places import IioPlace, ModbusLine
 from dcon.watchdog.limits import Rules
 from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.sites import bound_at
 
 if TYPE_CHECKING:
     from dcon.settings import Settings
@@ -47,6 +48,11 @@ def check_safeguards(settings: Settings) -> None:
             if port == where.port and (where.host == host or _is_here(where.host)):
                 raise Clash(f"{where}: there {name} is awaited; commands need a port of their own", "output.url")
     source = settings.line_input.url
+    if isinstance(source, Endpoint):
+        for name, host, port in _of_pmus(settings):
+            if port == source.port and _overlap(host, source.host):
+                problem = f"{source}: there {name} is awaited; the line's status needs a port of its own"
+                raise Clash(problem, "pdci.url", f"pmu {name}.url")
     if isinstance(source, ModbusLine) and source.keys.period_ms >= 1e3 * line.status_age_s:
         problem = f"{line.status_age_s:g}: must be above period_ms = {source.keys.period_ms:g} of url"
         raise Clash(problem, "pdci.status_age_s", "pdci.url")
@@ -122,15 +128,26 @@ def _reads_back(where: object) -> bool:
 
 def _awaited(settings: Settings) -> Iterator[tuple[str, str, int]]:
     """Who is awaited at a UDP port of this machine: name, host and port."""
-    for site in settings.sites:
-        url = site.url
-        if url.scheme is Scheme.UDP:
-            yield site.name, url.host, url.port
-        elif url.data_port:
-            yield site.name, url.data_host or "", url.data_port
+    yield from _of_pmus(settings)
     line = settings.line_input.url
     if isinstance(line, Endpoint):
         yield "the line's status", line.host, line.port
+
+
+def _of_pmus(settings: Settings) -> Iterator[tuple[str, str, int]]:
+    for site in settings.sites:
+        host, port = bound_at(site.url)
+        if port:
+            yield site.name, host, port
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Whether only one socket can be bound to these at the same port. A name is not asked for."""
+    try:
+        first, second = (ipaddress.ip_address("127.0.0.1" if host == "localhost" else host) for host in (one, other))
+    except ValueError:
+        return one == other
+    return first == second or (first.version == second.version and (first.is_unspecified or second.is_unspecified))
 
 
 def _is_loopback(host: str) -> bool:

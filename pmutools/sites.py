@@ -180,13 +180,13 @@ _EVERY_HOST = ("0.0.0.0", "::")
 
 def _same_port(one: Endpoint, two: Endpoint) -> bool:
     """Whether one is bound to every local address and the other to one of them, at the same port: only one can be."""
-    (host, port), (other, other_port) = _bound(one), _bound(two)
+    (host, port), (other, other_port) = bound_at(one), bound_at(two)
     if not port or port != other_port or host == other or (":" in host) != (":" in other):
         return False
     return host in _EVERY_HOST or other in _EVERY_HOST
 
 
-def _bound(url: Endpoint) -> tuple[str, int]:
+def bound_at(url: Endpoint) -> tuple[str, int]:
     """Where datagrams of an endpoint are received; port 0 where the system chooses, or there are none."""
     if url.scheme is Scheme.UDP:
         return url.host, url.port

@@ -53,6 +53,21 @@ MISTAKES = {
         "url = udp://127.0.0.1:7003\n[pdci]\nurl = udp://127.0.0.1:7003",
         "url: udp://127.0.0.1:7003: there the line's status is awaited",
     ),
+    "the line at a PMU's port": (
+        "[pdci]",
+        "url = udp://0.0.0.0:7001",
+        "url: udp://0.0.0.0:7001: there N1 is awaited; the line's status needs a port of its own",
+    ),
+    "at one of its addresses": (
+        "[pdci]",
+        "url = udp://localhost:7001?source=192.0.2.7",
+        "url: udp://localhost:7001?source=192.0.2.7: there N1 is awaited; the line's",
+    ),
+    "at the port of a PMU's data": (
+        "[pdci]",
+        "url = udp://127.0.0.1:7002",
+        "url: udp://127.0.0.1:7002: there S1 is awaited",
+    ),
     "a device that is asked too rarely": (
         "[pdci]",
         "url = modbus://h?period_ms=2000",
@@ -95,6 +110,8 @@ def test_what_defeats_a_safeguard_is_refused(
         "[output]\nurl = udp://127.0.0.1:7004\n" + LINE,
         "[pdci]\nurl = udp://0.0.0.0:7003?source=192.0.2.1",
         "[pdci]\nurl = modbus://192.0.2.1",
+        "[pdci]\nurl = udp://[::1]:7001",
+        "[pmu N2]\nurl = udp://127.0.0.1:7004\nside = north\n[pdci]\nurl = udp://127.0.0.2:7004?source=127.0.0.3",
         "[platform]\ntime_source = none\n" + LINE,
         "beats = control,udp,parse,gps,gui,pdci,server\nstatus = control.in,mine\n" + LINE,
     ],
