@@ -17,7 +17,7 @@ from dcon.core.pmu import end_run
 from dcon.core.rows import CORE
 from dcon.core.state import State, initial_state
 from dcon.core.step import step
-from dcon.core.values import NOTHING, Event, Inputs, Mode, Order, Record, Sample, Surroundings
+from dcon.core.values import NOTHING, Event, Inputs, Mode, Order, Record, Sample, Surroundings, brief
 from dcon.frontend import Binding, Reading, bind
 from pmutools.c37118 import Frame, StreamConfig
 from pmutools.errors import SettingsError, WireError
@@ -122,8 +122,9 @@ class Engine:
         try:
             self.configure(name, config)
         except SettingsError as error:
-            self._notes.append(Event("config_unusable", name, str(error)))
-            return str(error)
+            problem = brief(str(error))
+            self._notes.append(Event("config_unusable", name, problem))
+            return problem
         if known is not None:
             self._notes.append(Event("config_changed", name, f"data frames of {config.frame_size} bytes"))
             if bound is None or not bound.reads_like(self.bindings[name]):

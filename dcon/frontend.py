@@ -17,6 +17,8 @@ from pmutools.errors import SettingsError
 from pmutools.schema.frame_encoder import FrameEncoder
 from pmutools.schema.pmu_log import PmuFrame, pmu_frame
 
+SHOWN = 8
+"""Names of stations or channels in an error."""
 _ABSENT = complex(math.nan, math.nan)
 _new = tuple.__new__  # what calling a NamedTuple comes to, for half the time
 
@@ -161,7 +163,7 @@ def bind(
     columns = []
     for wanted in voltage:
         if wanted not in channels:
-            there = ", ".join(f"{c.name}" for c in chosen.phasors if c.kind == "V") or "no voltage phasors"
+            there = _some([c.name for c in chosen.phasors if c.kind == "V"]) or "no voltage phasors"
             raise SettingsError(f"PMU {name}: station {chosen.name} has no channel {wanted!r}; it has {there}")
         if chosen.phasors[channels.index(wanted)].kind != "V":
             raise SettingsError(f"PMU {name}: channel {wanted!r} of station {chosen.name} is a current")
@@ -186,8 +188,14 @@ def _station(name: str, config: StreamConfig, station: str | None) -> int:
             return 0
         raise SettingsError(
             f"PMU {name}: its stream {config.idcode} carries {len(names)} stations; pick one with "
-            f"station = {' | '.join(names)}"
+            f"station = {_some(names, ' | ')}"
         )
     if station not in names:
-        raise SettingsError(f"PMU {name}: stream {config.idcode} has no station {station!r}; it has {', '.join(names)}")
+        raise SettingsError(f"PMU {name}: stream {config.idcode} has no station {station!r}; it has {_some(names)}")
     return names.index(station)
+
+
+def _some(names: Sequence[str], between: str = ", ") -> str:
+    """The first of them, and how many there are more: a stream may have thousands."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return between.join(names[:SHOWN]) + more

@@ -177,6 +177,15 @@ class Event(NamedTuple):
     detail: str = ""
 
 
+DETAIL = 400
+"""Characters of what is said of a stream in the words of the stream: a status has the last 50 events."""
+
+
+def brief(text: str) -> str:
+    """At most :data:`DETAIL` characters of it."""
+    return text if len(text) <= DETAIL else f"{text[: DETAIL - 1]}…"
+
+
 class InstanceRecord(NamedTuple):
     """One control instance at the end of a tick."""
 

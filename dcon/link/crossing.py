@@ -16,6 +16,7 @@ from dataclasses import asdict, fields
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+from dcon.core.values import brief
 from dcon.link.counts import FrontCounts
 from dcon.link.failure import Failure
 from pmutools.c37118 import Frame
@@ -81,7 +82,7 @@ def _record(item: Item) -> bytes:
             source = _SOURCE_NUMBERS[frame.stamp_source]
             return _HEAD.pack(kind, source, pmu, frame.arrival_ns or 0, len(frame.data)) + frame.data
         case LinkEvent():
-            said = {name: getattr(item, name) for name in _EVENT_FIELDS}
+            said = {name: getattr(item, name) for name in _EVENT_FIELDS} | {"detail": brief(item.detail)}
             return _text(Kind.EVENT, json.dumps(said))
         case FrontCounts():
             return _text(Kind.COUNTS, json.dumps(asdict(item)))

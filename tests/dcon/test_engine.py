@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from support.swing import MS, START_NS, SWING_HZ, SWING_MHZ, Streams
 
 from dcon.core.differentiator import PAPER_60, response
-from dcon.core.values import InstanceState, Record, SystemState
+from dcon.core.values import DETAIL, InstanceState, Record, SystemState
 from dcon.engine import Engine
-from pmutools.c37118 import Format, Frame, PhasorChannel, PhasorScale, StreamConfig
+from pmutools.c37118 import Format, Frame, FrameType, PhasorChannel, PhasorScale, StreamConfig
 from pmutools.c37118.checksum import chk
 from pmutools.flow import StampSource
 from pmutools.grid.emulate import EmulatedStream
@@ -123,6 +123,17 @@ def test_a_change_that_moves_channels_starts_the_pmu_again() -> None:
     assert "selected N2-S1" in names(record)
     later = bench.run(40)
     assert bench.engine.unread == {} and later[-1].instances[0].state is InstanceState.READY
+
+
+def test_what_is_said_of_a_stream_in_its_own_words_is_brief() -> None:
+    """Names of CFG-3 have 255 bytes: fifty such events in a status would be cut off."""
+    bench = Bench()
+    config = bench.streams.streams["N1"].config
+    channels = tuple(PhasorChannel(f"{k}" + 120 * "é", 1) for k in range(100))
+    problem = bench.engine.reconfigure("N1", replace(station(config, phasors=channels), kind=FrameType.CFG3))
+    assert problem is not None and len(problem) == DETAIL and problem.startswith("PMU N1: station N1 has no channel")
+    (event,) = (event for event in bench.tick().events if event.name == "config_unusable")
+    assert event.detail == problem
 
 
 def test_an_unusable_configuration_costs_the_pmu_until_a_good_one_comes() -> None:

@@ -81,6 +81,7 @@ def changed(config: StreamConfig, **station: object) -> StreamConfig:
 
 
 SINGLE = EmulatedStream(PMUS[:1], 60).config
+MANY = replace(SINGLE, stations=tuple(replace(SINGLE.stations[0], name=f"S{k}") for k in range(2000)))
 
 
 @pytest.mark.parametrize(
@@ -98,6 +99,17 @@ SINGLE = EmulatedStream(PMUS[:1], 60).config
         (CONCENTRATOR.config, {}, "PMU N1: its stream 7 carries 3 stations; pick one with station = N1 | N2 | S1"),
         (CONCENTRATOR.config, {"station": "N9"}, "PMU N1: stream 7 has no station 'N9'; it has N1, N2, S1"),
         (replace(SINGLE, stations=()), {}, "carries 0 stations"),
+        (
+            MANY,
+            {},
+            "carries 2000 stations; pick one with station = S0 | S1 | S2 | S3 | S4 | S5 | S6 | S7 and 1992 more",
+        ),
+        (MANY, {"station": "N9"}, "no station 'N9'; it has S0, S1, S2, S3, S4, S5, S6, S7 and 1992 more"),
+        (
+            changed(SINGLE, phasors=tuple(PhasorChannel(f"V{k}", 1) for k in range(900))),
+            {},
+            "has no channel 'VA'; it has V0, V1, V2, V3, V4, V5, V6, V7 and 892 more",
+        ),
         (SINGLE, {"voltage": ("VX",)}, "PMU N1: station N1 has no channel 'VX'; it has VA, VB, VC, V1"),
         (SINGLE, {"voltage": ("I1",)}, "PMU N1: channel 'I1' of station N1 is a current"),
         (changed(SINGLE, phasors=()), {}, "has no channel 'VA'; it has no voltage phasors"),

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dcon.core.values import DETAIL
 from dcon.link.counts import FrontCounts
 from dcon.link.crossing import MESSAGE_BYTES, Item, PmuFrameIn, decode, encode
 from dcon.link.failure import Failure
@@ -39,6 +40,12 @@ def test_what_goes_in_comes_out_in_order(items: list[Item]) -> None:
     assert [item for _, inside in sent for item in inside] == items
     assert [item for message, _ in sent for item in decode(message)] == items
     assert all(len(message) <= MESSAGE_BYTES for message, _ in sent)
+
+
+def test_words_of_a_stream_are_held_to_what_a_log_has_room_for() -> None:
+    ((message, _),) = encode([LinkEvent(LinkKind.NOISE, "udp://[::]:1", (), 9999 * "x")])
+    (event,) = decode(message)
+    assert isinstance(event, LinkEvent) and event.detail == (DETAIL - 1) * "x" + "…"
 
 
 @given(ITEMS, st.integers(0, 1 << 20), st.integers(0, 255))
