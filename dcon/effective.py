@@ -112,7 +112,7 @@ def _shown(item: Field[Any], value: object) -> str:
     """With its unit."""
     if value is None or value == "":
         return NOT_SET
-    if isinstance(value, tuple):
+    if type(value) is tuple:  # an address is one too, and says itself how it is written
         return ",".join(map(str, value))
     text = f"{value:g}" if isinstance(value, float) else str(value)
     if isinstance(value, bool):

@@ -56,7 +56,8 @@ def _around(status: dict[str, Any]) -> Iterator[str]:
         shown = "nothing yet" if age is None else f"{was}{age:.0f} ms old" + ("" if f is None else f", {f:.4f} Hz")
         yield f"  {pmu['name']:<12} {shown}"
     for flag in status["flags"]:
-        yield f"  {f'{was}up' if flag['up'] else 'latched':<8} {flag['name']} {flag['subject']}: {flag['text']}"
+        where = " ".join(filter(None, (flag["name"], flag["subject"])))
+        yield f"  {f'{was}up' if flag['up'] else 'latched':<8} {where}: {flag['text']}"
     if counted := words(status["counts"] or {}):
         yield f"not taken: {counted}"
 
@@ -85,17 +86,21 @@ def _age(age_ms: float | None) -> str:
 
 
 def _log(status: dict[str, Any]) -> str:
-    lag_s = status["log"]["lag_s"]
-    return "no log" if lag_s is None else f"log {lag_s:.1f} s behind"
+    log = status["log"]
+    if log["refused"]:
+        return "log NOT WRITTEN"
+    return "no log" if log["lag_s"] is None else f"log {log['lag_s']:.1f} s behind"
 
 
 def _log_line(status: dict[str, Any]) -> str:
     log = status["log"]
     disk = "" if log["disk_free_percent"] is None else f", disk {log['disk_free_percent']:.0f} % free"
     missing = f"{log['unlogged_ticks']} ticks missing{disk}"
+    if log["refused"]:
+        return f"log NOT WRITTEN: the system takes nothing for {log['file'] or 'its file'}; is the disk full? {missing}"
     if log["lag_s"] is None:
         return f"no log, {missing}"
-    trouble = ", the disk hangs" if log["hangs"] else ", the system lets nothing be written" if log["refused"] else ""
+    trouble = ", the disk hangs" if log["hangs"] else ""
     return f"log {log['file']}, {log['lag_s']:.1f} s behind{trouble}, {missing}"
 
 

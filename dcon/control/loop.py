@@ -66,6 +66,8 @@ TROUBLE = frozenset(
         LinkKind.OWN_DROPS,
     )
 )
+WORDS = {LinkKind.NOTHING: "", LinkKind.NO_CONFIG: "data came, but no configuration that fits them: "}
+"""What goes before the detail, where that is not the kind itself."""
 _DISARM = (Order(str(Trigger.DISARM)),)
 
 
@@ -244,8 +246,7 @@ class Platform:
     def _tell(self, news: LinkEvent) -> None:
         self._told[news.kind] += 1
         level = logging.WARNING if news.kind in TROUBLE and self._told[news.kind] <= TOLD else logging.INFO
-        kind = "" if news.kind is LinkKind.NOTHING else f"{news.kind} "  # that nothing came is what the detail says
-        LOG.log(level, "%s: %s%s", news.label or news.where, kind, news.detail)
+        LOG.log(level, "%s: %s%s", news.label or news.where, WORDS.get(news.kind, f"{news.kind} "), news.detail)
 
     def _configure(self, name: str, frame: Frame) -> None:
         engine = self.engine

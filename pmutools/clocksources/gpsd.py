@@ -49,6 +49,7 @@ class GpsReports:
         """Reports with a fix."""
         self.unreadable = 0
         """Lines that are no report."""
+        self._has_spoken = False
         self._rest = b""
         self._fixes: dict[str, tuple[int, float | None]] = {}
         """Mode and time uncertainty of each receiver."""
@@ -63,6 +64,7 @@ class GpsReports:
 
     def feed(self, data: bytes) -> None:
         """Take bytes; a line that is too long to be a report is passed over."""
+        self._has_spoken = True
         *lines, rest = (self._rest + data).split(b"\n")
         for line in lines:
             if line.strip():
@@ -74,7 +76,7 @@ class GpsReports:
     def clock(self) -> GpsClock:
         """What was reported so far. Raises NoAnswer where that is nothing about time."""
         if not self.release and not self.positions:
-            raise NoAnswer("what answers there is not gpsd")
+            raise NoAnswer("what answers there is not gpsd" if self._has_spoken else "gpsd says nothing; does it hang?")
         if self.devices == 0:
             raise NoAnswer("gpsd has no receiver")
         mode, time_error_s = max(self._fixes.values(), key=lambda fix: fix[0], default=(0, None))

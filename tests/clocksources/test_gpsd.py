@@ -158,9 +158,11 @@ def serving(answer: bytes, *, close: bool = False) -> Iterator[Gpsd]:
 
 
 def test_who_is_not_gpsd() -> None:
-    for answer in (b"220 mail.example.org ESMTP\r\n", b"", b"\0" * 1000):
+    for answer in (b"220 mail.example.org ESMTP\r\n", b"\0" * 1000):
         with serving(answer, close=True) as place, pytest.raises(NoAnswer, match="is not gpsd"):
             ask_gpsd(place, Patience(2))
+    with serving(b"", close=True) as place, pytest.raises(NoAnswer, match="says nothing"):
+        ask_gpsd(place, Patience(2))
     with pytest.raises(NoAnswer, match=r"no gpsd at 127.0.0.1:.*nobody listens"):
         ask_gpsd(Gpsd(port=free_ports(1)[0]), Patience(2))
 
@@ -169,7 +171,7 @@ def test_who_is_not_gpsd() -> None:
 def test_who_says_nothing_costs_no_more_than_the_time_given() -> None:
     with serving(b"") as place:
         began = time.monotonic()
-        with pytest.raises(NoAnswer, match="is not gpsd"):
+        with pytest.raises(NoAnswer, match=r"^gpsd says nothing; does it hang\?$"):
             ask_gpsd(place, Patience(0.3))
         assert time.monotonic() - began < 2
 

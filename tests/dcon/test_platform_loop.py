@@ -208,6 +208,8 @@ def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pyte
         LinkEvent(LinkKind.FOREIGN, f"udp://192.0.2.9:{port}", (0,), f"IDCODE {port} comes from there")
         for port in range(1, 200)
     ]
+    held = "held until one comes; a spontaneous sender repeats its own about once a minute"
+    news.append(LinkEvent(LinkKind.NO_CONFIG, "udp://127.0.0.1:4803", (1,), held))
     news.append(LinkEvent(LinkKind.OWN_DROPS, "udp://127.0.0.1:4801", (0,), "buffer full", datagrams=7))
     news.append(LinkEvent(LinkKind.STREAMING, "udp://192.0.2.101:4713", (0,)))
     made = bench([*stream(1), *((START_NS + MS, event) for event in news)])
@@ -216,4 +218,5 @@ def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pyte
     told = [entry.getMessage() for entry in caplog.records]
     assert told[0] == "udp://127.0.0.1:4802: nothing has come; is the sender on?"
     assert told[1] == "udp://192.0.2.9:1: foreign IDCODE 1 comes from there"
-    assert len(told) == TOLD + 2 and told[-1] == "udp://127.0.0.1:4801: own-drops buffer full"
+    assert told[-2] == f"udp://127.0.0.1:4803: data came, but no configuration that fits them: {held}"
+    assert len(told) == TOLD + 3 and told[-1] == "udp://127.0.0.1:4801: own-drops buffer full"

@@ -638,6 +638,35 @@ def test_every_setting_says_where_it_comes_from_and_every_number_its_unit() -> N
     assert (gain.value, gain.default) == ("9 MW/mHz", None) and gain.source.startswith("section VI")
 
 
+FITTED = """[platform]
+gpsd = [::1]:2948
+run_dir = /run/dcon
+[watchdog]
+beats = control,udp,parse
+estop_a = /sys/a
+[server]
+listen = 0.0.0.0:4792
+keys = keys.ini
+[output]
+url = modbus://192.0.2.1?readback=5
+[pdci]
+url = modbus://192.0.2.2:503
+"""
+
+
+@pytest.mark.parametrize("text", [PAIR, GOOD, PAIR + FITTED], ids=["bare", "given", "fitted"])
+def test_every_value_that_is_printed_can_be_copied_into_a_file(text: str) -> None:
+    """But for the unit of a number."""
+    rows = effective(parse(text, "dcon.ini"))
+    sections: dict[str, list[str]] = {}
+    for row in rows:
+        number, *unit = row.value.split(" ")
+        value = number if unit and number.replace(".", "", 1).removeprefix("-").isdigit() else row.value
+        sections.setdefault(row.section, []).extend([] if value == "not set" else [f"{row.key} = {value}"])
+    copied = "".join(f"[{name}]\n" + "".join(f"{line}\n" for line in lines) for name, lines in sections.items())
+    assert [row[:3] for row in effective(parse(copied, "copied.ini"))] == [row[:3] for row in rows]
+
+
 def test_a_default_that_is_written_out_comes_from_the_file() -> None:
     text = f"{PAIR}[controller]\nInit_S = 20\npriority = N1-S1\n[supervisor]\ngap_ms = 50\n[log]\nmax_mb = 1000\n"
     rows = {(row.section, row.key): row for row in effective(parse(text, "dcon.ini", ("platform.fifo=true",)))}

@@ -160,7 +160,19 @@ def test_a_log_that_is_not_there_is_not_behind() -> None:
     assert lines(log=none)[-1] == "no log, 60 ticks missing"
     assert "  no log" in status_text.line(status(log=none)) and "log 0.3 s behind" in status_text.line(status())
     assert ", the disk hangs, " in lines(log={"hangs": True})[-1]
-    assert ", the system lets nothing be written, " in lines(log={"refused": True})[-1]
+    full = {"refused": True, "unlogged_ticks": 390, "disk_free_percent": 0.0}
+    said = "log NOT WRITTEN: the system takes nothing for /a/s.mcap; is the disk full? 390 ticks missing, disk 0 % free"
+    assert lines(log=full)[-1] == said and "  log NOT WRITTEN" in status_text.line(status(log=full))
+
+
+def test_a_flag_of_which_only_the_name_is_known_has_no_subject() -> None:
+    """Of a check that was up before the server was started: its tick says that it is up, and no more."""
+    known = status()
+    flags = [
+        {"name": name, "subject": subject, "text": "why", "up": True} for name, subject in (("disk", ""), ("a", "b"))
+    ]
+    said = status_text.text({**known, "flags": flags}).splitlines()
+    assert "  up       disk: why" in said and "  up       a b: why" in said
 
 
 def test_counts_are_all_there_and_those_that_tell_something_are_shown() -> None:
