@@ -35,15 +35,15 @@ class Told(NamedTuple):
 
 def outcome(verb: Verb, status: WatchdogStatus) -> str:
     """What the watchdog has made of an order, by a status from after that."""
+    causes = " ".join(status.causes)
     match verb:
         case Verb.ESTOP if status.closed:
             return f"{TOLD}, and its relays are closed still"
         case Verb.RESET if status.state is WatchdogState.TRIPPED:
-            causes = " ".join(status.causes)
             tripped = f"{TOLD}, and is still tripped"
             return f"{tripped}: {causes}; when that is over, order it again" if causes else f"{tripped}: order it again"
         case Verb.RESET:
-            return f"{TOLD}, and is not tripped"
+            return f"{TOLD}, and is not tripped" + ("" if status.healthy else f", but not healthy: {causes}")
     return TOLD
 
 

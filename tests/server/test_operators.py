@@ -445,6 +445,12 @@ AFTER = [
         f"reset: accepted; STATE; {TOLD}, and is still tripped: control; when that is over, order it again",
     ),
     ("reset", (0, 0, 7, 2, False, 0), 0, f"reset: accepted; STATE; {TOLD}, and is still tripped: order it again"),
+    (
+        "reset",
+        (0, 0, 7, 0, False, 1 << CAUSE_BITS.index("stamp")),
+        0,
+        f"reset: accepted; STATE; {TOLD}, and is not tripped, but not healthy: stamp",
+    ),
     ("release", (0, 0, 7, 2, False, 1), 0, f"release: accepted; STATE; {TOLD}"),
     ("estop", (0, 0, 6, 2, False, 0), 0, f"estop: accepted; STATE; {TOLD}"),
     (
