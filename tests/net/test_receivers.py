@@ -35,15 +35,19 @@ EAGER = Timing(answer_ns=300 * MS)
 paths = pytest.mark.parametrize("native", [linux.NATIVE, False], ids=["native", "portable"])
 
 
-@pytest.fixture(params=["polled", "soaked"], autouse=True)
+WAY: dict[str, Any] = {}
+
+
+@pytest.fixture(params=["polled", "soaked", "only wanted"], autouse=True)
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything holds whichever way what comes is received."""
     monkeypatch.setattr(Ear, "soaked", request.param == "soaked")
+    monkeypatch.setitem(WAY, "only_wanted", request.param == "only wanted")
 
 
 @contextmanager
-def ears(*urls: str, native: bool = linux.NATIVE, **options: object) -> Iterator[Ear]:
-    with Receivers([parse_endpoint(url) for url in urls], CLOCK, native=native, **options) as receivers:  # type: ignore[arg-type]
+def ears(*urls: str, native: bool = linux.NATIVE, **options: Any) -> Iterator[Ear]:
+    with Receivers([parse_endpoint(url) for url in urls], CLOCK, native=native, **{**WAY, **options}) as receivers:
         yield Ear(receivers, Ear.soaked)
 
 
