@@ -12,6 +12,7 @@ from typing import Any
 from dcon.link.orders import ANSWER_NS, REPLAYED, TOO_OLD, Operator, SignedOrder, sign
 from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, join_host
+from pmutools.net.sockets import refuse_itself
 from pmutools.timebase import NS
 
 CONNECT_S = 3.0
@@ -71,7 +72,7 @@ class Client:
         self._name = join_host(where.host, where.port)
         self._rest = b""
         try:
-            self._sock = socket.create_connection((where.host, where.port), CONNECT_S)
+            self._sock = _connected(where)
         except OSError as error:
             raise SourceError(f"{self._name}: {error.strerror or error}; is dcon server running there?") from None
         self._patience_s = patience_s
@@ -127,3 +128,14 @@ class Client:
         if not isinstance(said, dict):
             raise SourceError(f"{self._name}: not what a dcon server says")
         return said
+
+
+def _connected(where: Endpoint) -> socket.socket:
+    """Raises OSError."""
+    sock = socket.create_connection((where.host, where.port), CONNECT_S)
+    try:
+        refuse_itself(sock)
+    except OSError:
+        sock.close()
+        raise
+    return sock

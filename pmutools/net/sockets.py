@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import socket
 import struct
 import sys
@@ -77,6 +78,17 @@ def listening_socket(address: Address, backlog: int, called: str) -> socket.sock
         sock.close()
         raise explain(error, called) from None
     return sock
+
+
+def refuse_itself(sock: socket.socket) -> None:
+    """Raise ConnectionRefusedError where a TCP socket has reached nobody but itself.
+
+    Who tries a local port again and again that nobody listens at may be given that port as its own, and the two SYNs
+    meet (RFC 9293, 3.5). What is left of such a connection would keep a server from its port for a minute.
+    """
+    if sock.getsockname() == sock.getpeername():
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
 
 
 _REMEDIES = {

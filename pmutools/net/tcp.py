@@ -23,6 +23,7 @@ from pmutools.net.sockets import (
     Address,
     explain,
     listening_socket,
+    refuse_itself,
     resolve,
     stamp_arrivals,
     stamp_source,
@@ -109,6 +110,7 @@ class TcpClient:
         error = self._refused or self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if error:
             raise OSError(error, os.strerror(error))
+        refuse_itself(self._sock)
         self.flow = self.flow._replace(destination=str(Address(self.address.family, self._sock.getsockname())))
 
     def read(self) -> Chunk | None:

@@ -233,6 +233,20 @@ def test_a_port_in_use_is_told_with_a_remedy() -> None:
     listener.close()
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_connection_to_itself_is_refused_and_leaves_the_port_to_a_server(host: str) -> None:
+    """The system may give a client the very port that it tries, where nobody listens at it."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        address = Address(family, probe.getsockname())
+    client = TcpClient(address, local=address)
+    with pytest.raises(ConnectionRefusedError):
+        client.finish()
+    client.close()
+    TcpListener(host, address.port).close()
+
+
 def test_ipv6_and_ipv4_listen_on_one_port_and_who_cannot_is_told_by_its_name() -> None:
     with listening_socket(resolve("::", 0, datagram=False), 1, "six") as six:
         four = resolve("0.0.0.0", six.getsockname()[1], datagram=False)

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from dcon.session.reader import SessionReader
 from dcon.watchdog.codec import encode_status
 from pmutools.cli.shell import run
 from pmutools.net.endpoint import Endpoint, Scheme
+from pmutools.net.tcp import TcpListener
 from pmutools.timebase import NS
 
 pytestmark = pytest.mark.realtime
@@ -522,7 +524,9 @@ def test_a_watchdog_that_is_told_and_says_nothing_and_one_that_is_not_there(
         site.watchdog = bind_datagram(site.run_dir, paths.WATCHDOG)
 
 
-def test_a_deaf_controller_and_none_at_all(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_deaf_controller_and_none_at_all(
+    site: Site, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     site.platform.deaf = True
     began = time.monotonic()
     site.words()
@@ -540,6 +544,12 @@ def test_a_deaf_controller_and_none_at_all(site: Site, capsys: pytest.CaptureFix
         assert capsys.readouterr().err == f"{said}: order it again\n"
     site.until(lambda: site.status()["controller_connected"] is False)
     assert site.server.end() == 0
+    with monkeypatch.context() as patch:  # the system may give a client the very port that it tries
+        itself = partial(socket.create_connection, source_address=("127.0.0.1", site.server.port))
+        patch.setattr(client_side.socket, "create_connection", itself)
+        assert site.ctl("status") == 1
+        assert capsys.readouterr().err.endswith("Connection refused; is dcon server running there?\n")
+    TcpListener("127.0.0.1", site.server.port).close()
     assert site.ctl("status") == 1
     assert capsys.readouterr().err.endswith("is dcon server running there?\n")
     assert site.ctl("estop") == 1

@@ -30,12 +30,12 @@ def iio_device(folder: Path, **files: str) -> Path:
 
 
 def counts(device: Path, channel: int = 0) -> int:
-    """What has been written to the DAC."""
-    return int((device / f"out_voltage{channel}_raw").read_text())
+    """What has been written to the DAC; the fake is a plain file, read again where a write to it is seen half done."""
+    while not (text := (device / f"out_voltage{channel}_raw").read_text()).strip():
+        pass
+    return int(text)
 
 
 def volts(device: Path, channel: int = 0) -> float:
-    """What the DAC drives; the fake is a plain file, and is read again where a write to it is seen half done."""
-    while not (text := (device / f"out_voltage{channel}_raw").read_text()).strip():
-        pass
-    return (int(text) - 32768) * SCALE_MV / 1000
+    """What the DAC drives."""
+    return (counts(device, channel) - 32768) * SCALE_MV / 1000

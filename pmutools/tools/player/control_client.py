@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pmutools.errors import PmuError, SourceError
-from pmutools.net.sockets import explain, resolve
+from pmutools.net.sockets import explain, refuse_itself, resolve
 from pmutools.tools.player.control import PROTOCOL, to_json
 from pmutools.tools.player.control_address import ControlAddress
 
@@ -121,6 +121,8 @@ def _connected(address: ControlAddress, timeout_s: float) -> socket.socket:
     try:
         sock.settimeout(timeout_s)
         sock.connect(where)
+        if not address.path:
+            refuse_itself(sock)
     except OSError as error:
         sock.close()
         if isinstance(error, TimeoutError):
