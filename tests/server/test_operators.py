@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.live import free_ports
 from support.operated import FakePlatform
 from support.shipped import ServerProcess, eventually
 
@@ -32,6 +33,7 @@ from dcon.session.codec import Watchdog
 from dcon.session.reader import SessionReader
 from dcon.watchdog.codec import encode_status
 from pmutools.cli.shell import run
+from pmutools.errors import SourceError
 from pmutools.net.endpoint import Endpoint, Scheme
 from pmutools.net.tcp import TcpListener
 from pmutools.timebase import NS
@@ -524,9 +526,19 @@ def test_a_watchdog_that_is_told_and_says_nothing_and_one_that_is_not_there(
         site.watchdog = bind_datagram(site.run_dir, paths.WATCHDOG)
 
 
-def test_a_deaf_controller_and_none_at_all(
-    site: Site, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_who_reaches_nobody_but_itself_is_refused_and_leaves_the_port_to_a_server(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The system may give a client the very port that it tries, where nobody listens at it."""
+    (port,) = free_ports(1)
+    itself = partial(socket.create_connection, source_address=("127.0.0.1", port))
+    monkeypatch.setattr(client_side.socket, "create_connection", itself)
+    with pytest.raises(SourceError, match=r"Connection refused; is dcon server running there\?"):
+        Client(Endpoint(Scheme.TCP, "127.0.0.1", port))
+    TcpListener("127.0.0.1", port).close()
+
+
+def test_a_deaf_controller_and_none_at_all(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     site.platform.deaf = True
     began = time.monotonic()
     site.words()
@@ -544,12 +556,6 @@ def test_a_deaf_controller_and_none_at_all(
         assert capsys.readouterr().err == f"{said}: order it again\n"
     site.until(lambda: site.status()["controller_connected"] is False)
     assert site.server.end() == 0
-    with monkeypatch.context() as patch:  # the system may give a client the very port that it tries
-        itself = partial(socket.create_connection, source_address=("127.0.0.1", site.server.port))
-        patch.setattr(client_side.socket, "create_connection", itself)
-        assert site.ctl("status") == 1
-        assert capsys.readouterr().err.endswith("Connection refused; is dcon server running there?\n")
-    TcpListener("127.0.0.1", site.server.port).close()
     assert site.ctl("status") == 1
     assert capsys.readouterr().err.endswith("is dcon server running there?\n")
     assert site.ctl("estop") == 1
