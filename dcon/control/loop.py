@@ -66,7 +66,7 @@ TROUBLE = frozenset(
         LinkKind.OWN_DROPS,
     )
 )
-WORDS = {LinkKind.NOTHING: "", LinkKind.NO_CONFIG: "data came, but no configuration that fits them: "}
+WORDS = {LinkKind.NOTHING: "", LinkKind.NO_CONFIG: "no configuration for its data: "}
 """What goes before the detail, where that is not the kind itself."""
 _DISARM = (Order(str(Trigger.DISARM)),)
 

@@ -21,7 +21,7 @@ ROUND_NS = 10_000_000
 """The longest that a round waits for something to come."""
 BEAT_NS = 10_000_000
 PARSE_NS = 5_000_000
-"""A turn parses for so long, and one datagram more; what is left waits for the next: each port has its turn."""
+"""A turn parses for so long, and one chunk more; what is left waits for the next (:mod:`dcon.front.turns`)."""
 KEPT = 1000
 """News that may wait for room in the pair; the oldest go first. Of configurations the newest of each PMU waits too."""
 COUNTS_NS = 500_000_000

@@ -1,4 +1,4 @@
-"""What was received and is not parsed yet: streams take turns, so that what one has more than its share delays nobody.
+"""What was received and is not parsed yet: streams take turns, so that a flood of one delays no other.
 
 Datagrams queue by the port that they came to and the PMU that they claim to be of; those that claim to be of none that
 is asked for have one queue a port. There are no more queues than PMUs, ports and connections.

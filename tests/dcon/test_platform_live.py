@@ -280,7 +280,7 @@ def test_50_frames_a_second_end_the_start_in_one_line(sessions: Sessions) -> Non
     assert session.code == 2
     *before, said = session.err.splitlines()
     told = (
-        "data came, but no configuration that fits them: held until one comes",
+        "no configuration for its data: held until one comes",
         "frames/s, the controller runs at 60",
     )  # where data came first; of one PMU
     assert all(any(words in line for words in told) for line in before)

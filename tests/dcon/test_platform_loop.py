@@ -218,5 +218,5 @@ def test_trouble_with_streams_is_told_and_never_floods(bench: Make, caplog: pyte
     told = [entry.getMessage() for entry in caplog.records]
     assert told[0] == "udp://127.0.0.1:4802: nothing has come; is the sender on?"
     assert told[1] == "udp://192.0.2.9:1: foreign IDCODE 1 comes from there"
-    assert told[-2] == f"udp://127.0.0.1:4803: data came, but no configuration that fits them: {held}"
+    assert told[-2] == f"udp://127.0.0.1:4803: no configuration for its data: {held}"
     assert len(told) == TOLD + 3 and told[-1] == "udp://127.0.0.1:4801: own-drops buffer full"

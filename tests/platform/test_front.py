@@ -280,13 +280,14 @@ def test_pmus_at_one_port_have_turns_of_their_own(tmp_path: Path, kind: str) -> 
         "frames": [rig.streams.data("N1", time.time_ns())] * FLOOD,
         "junk": [rng.randbytes(100) for _ in range(FLOOD)],
     }[kind]
+    sent, heard = list[bytes](), list[bytes]()
     while flood:
         now, flood = flood[:60], flood[60:]
         for datagram in now:
             rig.sock.sendto(datagram, ("127.0.0.1", rig.ports[0]))
-        sent = rig.send(1)
-        found = [item for item in rig.turn() if isinstance(item, PmuFrameIn) and item.pmu == 1]
-        assert [item.frame.data for item in found] == [sent], "in the very next turn"
+        sent.append(rig.send(1))
+        heard += [item.frame.data for item in rig.turn() if isinstance(item, PmuFrameIn) and item.pmu == 1]
+        assert heard == sent[: len(heard)] and len(sent) - len(heard) <= 1, "in the next turn, or the one after it"
     rig.close()
 
 
