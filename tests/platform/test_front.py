@@ -20,23 +20,21 @@ import pytest
 from support.live import free_udp_port
 from support.swing import Streams
 
-from dcon.control.linked import ITEMS_A_TICK, PairFrames, pair
-from dcon.front.front import KEPT, PARSE_NS, ROUND_NS, Front, Outlet
+from dcon.control.linked import PairFrames, pair
+from dcon.front.front import PARSE_NS, ROUND_NS, Front, Outlet
 from dcon.front.receiving import Reception
 from dcon.link.beats import LoopName
 from dcon.link.children import launch
 from dcon.link.counts import FrontCounts
-from dcon.link.crossing import Item, PmuFrameIn, decode, encode
+from dcon.link.crossing import Item, PmuFrameIn
 from dcon.link.failure import Failure
 from dcon.link.paths import Sender
 from dcon.link.pulse import Pulse
 from dcon.settings import parse
-from pmutools.c37118 import Command, Frame, encode_command, encode_header
+from pmutools.c37118 import Command, encode_command, encode_header
 from pmutools.c37118.checksum import sealed
 from pmutools.c37118.config import encode_config
 from pmutools.clock import SystemClock
-from pmutools.flow import StampSource
-from pmutools.net.dialogue import LinkEvent, LinkKind
 
 pytestmark = [
     pytest.mark.realtime,
@@ -429,93 +427,6 @@ def test_a_control_process_that_stands_still_is_not_waited_for_and_loses_no_conf
     assert taken + rig.counts.crowded == sent
 
 
-def test_what_a_tick_takes_from_the_pair_is_bounded_and_the_rest_comes_with_the_next() -> None:
-    ours, theirs = pair()
-    frames = PairFrames(ours, CLOCK)
-    with ours, theirs:
-        theirs.setblocking(False)
-        items = [PmuFrameIn(0, Frame(number.to_bytes(4, "big"), 1, StampSource.KERNEL, 0)) for number in range(30_000)]
-        largest = 0
-        for message, inside in encode(items):
-            theirs.send(message)
-            largest = max(largest, len(inside))
-        taken = list[Item]()
-        while found := frames.take():
-            assert len(found) < ITEMS_A_TICK + largest
-            taken += found
-    assert taken == items
-
-
-def config(pmu: int, mark: int, nbytes: int = 60_000) -> PmuFrameIn:
-    return PmuFrameIn(pmu, Frame(bytes([mark]) * nbytes, 1, StampSource.KERNEL, 0), is_config=True)
-
-
-def test_data_never_overtake_a_configuration_that_found_no_room() -> None:
-    """There is room for small messages, and for no large one."""
-    ours, theirs = pair(SMALL_BYTES)
-    with ours, theirs:
-        ours.setblocking(False)
-        outlet = Outlet(theirs, FrontCounts())
-        big, data = Frame(bytes(60_000), 1, StampSource.KERNEL, 0), Frame(b"d", 1, StampSource.KERNEL, 0)
-        sent = 0
-        while outlet._counts.crowded == 0:
-            outlet.add(PmuFrameIn(0, big))
-            outlet.flush()
-            sent += 1
-            assert sent < 1000
-        for item in (config(1, 7), PmuFrameIn(1, data), config(1, 8), PmuFrameIn(1, data), PmuFrameIn(0, big)):
-            outlet.add(item)
-        outlet.flush()
-        outlet.add(PmuFrameIn(1, data))
-        outlet.flush()
-        found: list[Item] = []
-        for _ in range(sent + 5):
-            try:
-                found += decode(ours.recv(1 << 18))
-            except BlockingIOError:
-                outlet.flush()
-        frames = [item for item in found if isinstance(item, PmuFrameIn) and item.pmu == 1]
-        assert frames == [config(1, 8)], "the newest, and none of the data before it"
-        assert outlet._counts.crowded == 1 + 4
-
-
-def test_news_without_end_push_no_configuration_out() -> None:
-    ours, theirs = pair(SMALL_BYTES)
-    with ours, theirs:
-        ours.setblocking(False)
-        outlet = Outlet(theirs, FrontCounts())
-        while not outlet._counts.crowded:
-            outlet.add(PmuFrameIn(0, Frame(bytes(60_000), 1, StampSource.KERNEL, 0)))
-            outlet.flush()
-        for pmu in range(3):
-            outlet.add(config(pmu, pmu))
-        for number in range(3 * KEPT):
-            outlet.add(LinkEvent(LinkKind.FOREIGN, f"{number}" + 1000 * "x", ()))
-            outlet.flush()
-        found: list[Item] = []
-        for _ in range(100):
-            with suppress(BlockingIOError):
-                found += decode(ours.recv(1 << 18))
-            outlet.flush()
-        assert [item for item in found if isinstance(item, PmuFrameIn) and item.is_config] == [
-            config(pmu, pmu) for pmu in range(3)
-        ]
-        assert sum(isinstance(item, LinkEvent) for item in found) <= KEPT + 200
-
-
-def test_news_that_wait_are_bounded() -> None:
-    ours, theirs = pair(SMALL_BYTES)
-    with ours, theirs:
-        outlet = Outlet(theirs, FrontCounts())
-        for number in range(5 * KEPT):
-            outlet.add(LinkEvent(LinkKind.FOREIGN, f"{number}", ()))
-            if number % 100 == 0 or number < KEPT:
-                outlet.flush()
-        outlet.flush()
-        assert len(outlet._news) == KEPT
-        assert outlet.is_open
-
-
 def test_the_end_of_the_pair_is_the_end_of_the_front(rig: Rig) -> None:
     rig.ours.close()
     rig.front._counted_ns = 0
@@ -581,15 +492,3 @@ def test_a_killed_front_is_seen_at_once(tmp_path: Path) -> None:
     process.wait(5)
     assert frames.take() == []
     frames.close()
-
-
-def test_a_frame_of_a_capture_keeps_its_source() -> None:
-    """Stamps of all sources cross the pair."""
-    ours, theirs = pair()
-    with ours, theirs:
-        outlet = Outlet(theirs, FrontCounts())
-        frames = [PmuFrameIn(3, Frame(b"x", 5, source, 0)) for source in StampSource]
-        for item in frames:
-            outlet.add(item)
-        outlet.flush()
-        assert list(decode(ours.recv(1 << 17))) == frames
